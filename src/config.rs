@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use axum::http::{HeaderValue, Uri};
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
 use strum::IntoStaticStr;
@@ -46,6 +47,12 @@ pub struct ServeArguments {
     /// machine. While there are no tokens, requests of browsers with another name are refused.
     #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
     pub hosts: Vec<String>,
+
+    /// Origins of pages on other hosts or ports that may use the API with a token, such as https://lab.example, separated
+    /// by commas. Without tokens they may use it freely.
+    #[arg(long = "cors-origin", env = "SCI_RECON_CORS_ORIGINS", value_name = "ORIGIN", value_delimiter = ',',
+          value_parser = origin)]
+    pub cors_origins: Vec<HeaderValue>,
 
     /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
     /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
@@ -126,6 +133,10 @@ pub struct ServeArguments {
     /// Seconds that the check of a file for a calibration or measurement may take.
     #[arg(long, env = "SCI_RECON_CHECK_SECONDS", value_name = "SECONDS", default_value_t = 300.0, value_parser = seconds)]
     pub check_seconds: f64,
+
+    /// Requests that a token may send in a minute, in any rhythm; 0: no limit.
+    #[arg(long, env = "SCI_RECON_REQUESTS_PER_MINUTE", value_name = "N", default_value_t = 6000)]
+    pub requests_per_minute: u32,
 
     /// Jobs that may wait and run; further ones must try again later, except those of a lab with less than an
     /// equal share.
@@ -368,6 +379,22 @@ fn seconds(text: &str) -> Result<f64, String> {
 fn fraction(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
     share.ok_or_else(|| format!("{text:?} is not a share from 0 to 1"))
+}
+
+/// The origin of a page: scheme, host and port.
+fn origin(text: &str) -> Result<HeaderValue, String> {
+    let wrong = || {
+        format!("{text:?} is no origin: write scheme and host, such as https://lab.example:8443")
+    };
+    let uri: Uri = text.parse().map_err(|_| wrong())?;
+    let written = match (uri.scheme_str(), uri.authority()) {
+        (Some(scheme @ ("http" | "https")), Some(place)) => format!("{scheme}://{place}"),
+        _ => return Err(wrong()),
+    };
+    if written != text {
+        return Err(wrong());
+    }
+    HeaderValue::try_from(written).map_err(|_| wrong())
 }
 
 /// Reads a number of bytes: `1000000`, `10GB` (powers of 1000) or `8GiB` (of 1024).

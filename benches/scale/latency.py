@@ -3,7 +3,7 @@
     python latency.py SCI_RECON_BINARY [--size 64] [--frames 8] [--algorithm gap-tv] [--jobs 50]
 
 A lab waits for each such job while it adjusts the optics. Each job has another snapshot, because a repeated
-job would return the existing result. One connection is used: POST of the job, GET of its end (`?wait=`), GET
+job would return the existing result. One connection is used: POST of the job, GET of its end (`Prefer: wait`), GET
 of the frames as one EXR file. The last line is JSON: milliseconds of each part, median and slowest tenth.
 """
 import argparse
@@ -54,8 +54,9 @@ def main():
             measurements.append(service.call('POST', '/v1/measurements', {'calibration': calibration, 'data': service.upload(folder / 'one.npy')})['id'])
         connection = http.client.HTTPConnection(urllib.parse.urlsplit(service.url).netloc)
 
-        def ask(method, path, body=None):
-            connection.request(method, path, body and json.dumps(body), {'Content-Type': 'application/json'})
+        def ask(method, path, body=None, wait=0):
+            headers = {'Content-Type': 'application/json', 'Prefer': f'wait={wait}'}
+            connection.request(method, path, body and json.dumps(body), headers)
             answer = connection.getresponse()
             content = answer.read()
             if answer.status >= 300:
@@ -66,11 +67,11 @@ def main():
             times = [time.perf_counter()]
             job = json.loads(ask('POST', '/v1/jobs', {'measurement': measurement, 'algorithm': a.algorithm}))['id']
             times.append(time.perf_counter())
-            state = json.loads(ask('GET', f'/v1/jobs/{job}?wait=20'))
+            state = json.loads(ask('GET', f'/v1/jobs/{job}', wait=20))
             times.append(time.perf_counter())
             if state['state'] != 'succeeded':
                 raise SystemExit(f"the job {state['state']}: {state['error']}")
-            ask('GET', f'/v1/jobs/{job}/snapshots/0/stack.exr')
+            ask('GET', f'/v1/jobs/{job}/snapshots/0/exports/exr')
             times.append(time.perf_counter())
             for name, lap in zip(laps, [*np.diff(times), times[-1] - times[0]]):
                 laps[name].append(lap * 1e3)

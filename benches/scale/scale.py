@@ -102,10 +102,10 @@ def main():
         if state['state'] != 'succeeded':
             sys.exit(f"the job {state['state']}: {state['error']}")
         total = time.monotonic() - started
-        manifest = service.call('GET', f'/v1/jobs/{job}/manifest.json')
+        manifest = service.call('GET', f'/v1/jobs/{job}/exports/manifest')
         result, quality = folder / 'result.npy', []
         for snapshot, true in enumerate(truth.reshape(a.snapshots, a.frames, a.size, a.size)):
-            urllib.request.urlretrieve(f'{service.url}/v1/jobs/{job}/snapshots/{snapshot}/frames.npy', result)
+            urllib.request.urlretrieve(f'{service.url}/v1/jobs/{job}/snapshots/{snapshot}/exports/npy', result)
             quality.append(psnr_by_frame(result, true))
         lap('download')
         service.look()

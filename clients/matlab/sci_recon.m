@@ -180,7 +180,7 @@ function hash = upload(o, values)
     if isempty(location)
       status = curl(o, sprintf('-X POST -H "Tus-Resumable: 1.0.0" -H "Upload-Length: %d" -D "%s.head" -o "%s"', ...
                                total, file, answer), '/v1/uploads');
-      location = regexprep(header([file '.head'], 'Location'), '^https?://[^/]+', '');
+      location = ['/v1/uploads/' regexprep(header([file '.head'], 'Location'), '^.*/', '')];
     elseif failures > 0 || offset >= total
       status = curl(o, sprintf('-I -H "Tus-Resumable: 1.0.0" -D "%s.head" -o "%s"', file, answer), location);
       if any(status == [404 410])
@@ -232,12 +232,12 @@ function frames = download(o, path)
   file = tempname();
   clean = onCleanup(@() remove({file}));
   for attempt = 1:12
-    status = curl(o, sprintf('-C - -o "%s"', file), [path '/frames.npy']);
+    status = curl(o, sprintf('-C - -o "%s"', file), [path '/exports/npy']);
     if any(status == [200 206])
       break
     end
     if attempt == 12 || ~any(status == [0 408 429 502 503 504])
-      refuse(o, status, file, [path '/frames.npy']);
+      refuse(o, status, file, [path '/exports/npy']);
     end
     pause(min(0.1 * 2 ^ attempt, 30));
   end

@@ -4,6 +4,7 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::body::{Body, HttpBody};
 use axum::extract::{FromRequestParts, Request, State};
@@ -18,11 +19,13 @@ use headers::{Cookie, HeaderMapExt};
 use rustix::system::uname;
 
 use super::error::{ApiError, Code, Result};
+use super::rate::Rates;
 use super::revocation::{Grant, Revocations};
+use crate::config::ServeArguments;
 use engine::job::{Lab, Role, Secret, Timestamp, TokenId};
 use store::{Store, Token};
 
-/// The cookie of a session, which `POST /v1/session` sets.
+/// The cookie of a session, which `POST /view/session` sets.
 pub(super) const SESSION: &str = "sci_recon_session";
 /// What changes something by a session has this header: a page of another site can't set it.
 const CHANGES: &str = "x-requested-with";
@@ -119,19 +122,42 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
     }
 }
 
+/// The limits of the guard: names and origins that tell own pages from those of other sites, and the rate of requests.
+#[derive(Debug)]
+pub(super) struct Sites {
+    hosts: Vec<String>,
+    origins: Vec<HeaderValue>,
+    rates: Rates,
+}
+
+impl Sites {
+    pub(super) fn new(settings: &ServeArguments) -> Self {
+        let rates = Rates::new(settings.requests_per_minute);
+        Self { hosts: settings.hosts.clone(), origins: settings.cors_origins.clone(), rates }
+    }
+}
+
 /// Lets a request pass if its token may do what it wants. What is answered bit by bit ends when the token
 /// does.
 pub(super) async fn guard(
-    State((store, hosts, revocations, rule)): State<(Store, Arc<[String]>, Revocations, Rule)>,
+    State((store, sites, revocations, rule)): State<(Store, Arc<Sites>, Revocations, Rule)>,
     mut request: Request,
     next: Next,
 ) -> Response {
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
-    match admit((&store, &hosts), (rule, role), &mut request).await {
+    match admit((&store, &sites), (rule, role), &mut request).await {
         Ok(access) => {
             tracing::Span::current().record("lab", access.lab.as_str());
+            let rate = access.token.and_then(|token| sites.rates.take(token, Instant::now()));
+            let refusal = rate.and_then(|rate| rate.check().err());
             request.extensions_mut().insert(access.clone());
-            let response = next.run(request).await;
+            let mut response = match refusal {
+                Some(refusal) => refusal.into_response(),
+                None => next.run(request).await,
+            };
+            if let Some(rate) = rate {
+                rate.state(response.headers_mut());
+            }
             if response.body().size_hint().exact().is_some() {
                 return response;
             }
@@ -145,7 +171,7 @@ pub(super) async fn guard(
 }
 
 async fn admit(
-    (store, hosts): (&Store, &[String]),
+    (store, sites): (&Store, &Sites),
     (rule, role): (Rule, Role),
     request: &mut Request,
 ) -> Result<Access> {
@@ -160,15 +186,15 @@ async fn admit(
     };
     let Some((token, session)) = found else {
         if store.is_open().await? {
-            check_name(headers, hosts)?;
-            check_site(method, headers)?;
+            check_name(headers, &sites.hosts)?;
+            check_site(method, headers, &sites.origins)?;
             let access = Access::open();
             return choose_lab(store, rule, access, request).await;
         }
         return Err(missing());
     };
     if session.is_some() && !method.is_safe() {
-        check_site(method, headers)?;
+        check_site(method, headers, &[])?;
         if !headers.contains_key(CHANGES) {
             let detail = "what changes something by a session has the header X-Requested-With";
             return Err(ApiError::new(Code::ForeignSite, detail));
@@ -261,10 +287,11 @@ fn check_name(headers: &HeaderMap, names: &[String]) -> Result<()> {
     Err(ApiError::new(Code::ForeignSite, detail))
 }
 
-/// Refuses a change that a page of another site may have had a browser send, which tells by
-/// `Sec-Fetch-Site` or by the `Origin`.
-fn check_site(method: &Method, headers: &HeaderMap) -> Result<()> {
-    if method.is_safe() {
+/// Refuses a change that a page of another site may have had a browser send, as `Sec-Fetch-Site` or `Origin` show. Pages
+/// of the `allowed` origins may.
+fn check_site(method: &Method, headers: &HeaderMap, allowed: &[HeaderValue]) -> Result<()> {
+    let origin = headers.get(header::ORIGIN);
+    if method.is_safe() || origin.is_some_and(|origin| allowed.contains(origin)) {
         return Ok(());
     }
     let text = |name| text(headers, name);
@@ -335,7 +362,8 @@ mod tests {
             let lines = lines.iter().map(|(name, value)| headers(name, value));
             let all: HeaderMap =
                 lines.flatten().map(|(name, value)| (name.unwrap(), value)).collect();
-            check_name(&all, &["bench.example".into()]).is_ok() && check_site(&method, &all).is_ok()
+            check_name(&all, &["bench.example".into()]).is_ok()
+                && check_site(&method, &all, &["http://pages.example".parse().unwrap()]).is_ok()
         };
         for host in ["127.0.0.1:8080", "[::1]:8080", "LOCALHOST", "bench.example:80", "10.1.2.3"] {
             assert!(check(Method::POST, &[("host", host)]), "{host}");
@@ -357,6 +385,8 @@ mod tests {
         }
         let page = [own, ("origin", "http://127.0.0.1:8080"), ("sec-fetch-site", "same-origin")];
         assert!(check(Method::DELETE, &page));
+        let other = ("sec-fetch-site", "cross-site");
+        assert!(check(Method::POST, &[own, ("origin", "http://pages.example"), other]));
     }
 
     #[test]

@@ -1,30 +1,38 @@
-//! `/v1/algorithms`: what can be asked for, with the defaults.
+//! `/v1/algorithms`: the algorithms with their defaults.
 
-use axum::Json;
+use axum::response::Response;
 use serde::Serialize;
 
+use super::context::RequestContext;
+use super::error::Result;
 use engine::job::{Algorithm, Schedule, TileSpec};
 use engine::pipeline::networks;
 use strum::VariantArray;
 
-#[derive(Debug, Serialize)]
-pub(super) struct AlgorithmBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "AlgorithmInfo")]
+struct AlgorithmBody {
     name: Algorithm,
     summary: &'static str,
+    /// Networks of the default schedule.
     networks: Vec<&'static str>,
+    /// Priors that a schedule of this algorithm may name.
     priors: Vec<&'static str>,
     schedule: Schedule,
+    /// Iterations of the default schedule.
     planned_iterations: usize,
+    /// Passes of deep denoisers in the default schedule.
     planned_passes: usize,
     tile: TileSpec,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "AlgorithmList")]
 pub(super) struct ListBody {
     items: Vec<AlgorithmBody>,
 }
 
-pub(super) async fn list() -> Json<ListBody> {
+pub(super) async fn list(request: RequestContext) -> Result<Response> {
     let show = |name: Algorithm| {
         let schedule = name.default_schedule();
         AlgorithmBody {
@@ -42,5 +50,5 @@ pub(super) async fn list() -> Json<ListBody> {
             tile: name.default_tile(),
         }
     };
-    Json(ListBody { items: Algorithm::VARIANTS.iter().copied().map(show).collect() })
+    request.json(&ListBody { items: Algorithm::VARIANTS.iter().copied().map(show).collect() })
 }

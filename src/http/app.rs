@@ -9,6 +9,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
 use super::error::Result;
+use super::context::Wait;
 use super::events::Events;
 use super::metrics::Metrics;
 use super::rendering::Pictures;
@@ -38,6 +39,8 @@ pub struct Services {
     pub(super) admission: Admission,
     /// Each read takes a core and a frame of memory; a lab has one at a time.
     pub(super) intake: Turns,
+    /// Held by requests that change something, from the check of their condition to the change.
+    pub(super) changes: Mutex<()>,
     /// Ends what has no end of its own.
     pub(super) closing: CancellationToken,
     /// When it was last tried whether files can be written, and what came of it.
@@ -74,6 +77,7 @@ impl App {
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
             intake: Turns::new(READS_AT_ONCE, READS),
+            changes: Mutex::default(),
             closing,
             disk_tried: Mutex::default(),
             metrics,
@@ -86,6 +90,13 @@ impl App {
 }
 
 impl App {
+    /// How long a GET waits that prefers to; none for not at all. A proxy, or the limit on the time of answers, must not
+    /// come first.
+    pub(super) fn wait(&self, wait: Wait) -> Option<Duration> {
+        let time = wait.time(Duration::ZERO).min(self.settings.request_time() / 2);
+        (!time.is_zero()).then_some(time)
+    }
+
     /// Whether jobs with networks can be done; if not, why, and what to do. Looked up each time: the library
     /// may be put in its place while the service runs.
     pub(super) fn networks(&self) -> Result<(), String> {

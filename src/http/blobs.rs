@@ -2,23 +2,22 @@
 
 use std::str::FromStr;
 
-use axum::Json;
 use axum::body::Body;
 use axum::extract::{FromRequest, Multipart, Request};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ContentLength, HeaderMapExt};
 use serde::Deserialize;
-use serde_with::DeserializeFromStr;
 
 use super::access::Access;
 use super::admission::Reservation;
 use super::app::App;
+use super::context::{RequestContext, changed};
 use super::download::Download;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, check_digest, check_encoding, content_digest};
-use super::page::{Limit, PageBody};
-use super::shares::Place;
+use super::page::{Cursor, Limit, PageBody};
+use super::shares;
 use super::upload;
 use engine::job::{Sha256, Timestamp};
 use store::{Blob, BlobRow, StagedBlob};
@@ -68,22 +67,25 @@ pub(super) async fn put(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
-) -> Result<Json<Blob>> {
-    Ok(Json(app.store.upload(&access.lab, sha256).await?))
+    request: RequestContext,
+) -> Result<Response> {
+    request.json(&body(&app, &access, sha256).await?)
 }
 
-/// Where a list goes on: behind an upload of this time and hash. Opaque for clients.
-#[derive(Debug, DeserializeFromStr)]
-pub(super) struct BlobCursor(Timestamp, Sha256);
+async fn body(app: &App, access: &Access, sha256: Sha256) -> Result<Blob> {
+    Ok(app.store.upload(&access.lab, sha256).await?)
+}
 
-impl FromStr for BlobCursor {
-    type Err = &'static str;
+/// The place of an upload in the list: its time and hash.
+#[derive(Debug)]
+pub(super) struct Place(Timestamp, Sha256);
+
+impl FromStr for Place {
+    type Err = ();
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let parts = text.split_once('-');
-        let parts = parts.and_then(|(time, hash)| Some((time.parse().ok()?, hash.parse().ok()?)));
-        let (time, hash) = parts.ok_or("the cursor is none of this list")?;
-        Ok(Self(Timestamp(time), hash))
+        let (time, hash) = text.split_once('-').ok_or(())?;
+        Ok(Self(Timestamp(time.parse().map_err(|_| ())?), hash.parse().map_err(|_| ())?))
     }
 }
 
@@ -92,18 +94,19 @@ impl FromStr for BlobCursor {
 pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
-    cursor: Option<BlobCursor>,
+    cursor: Option<Cursor<Place>>,
 }
 
 /// `GET /v1/blobs`: the lab's files, newest first.
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<BlobRow>>> {
-    let after = query.cursor.map(|BlobCursor(time, sha256)| (time, sha256));
+    request: RequestContext,
+) -> Result<Response> {
+    let after = query.cursor.map(|Cursor(Place(time, sha256))| (time, sha256));
     let page = app.store.uploads(&access.lab, after, query.limit.get()).await?;
     let cursor = |row: &BlobRow| format!("{}-{}", row.blob.created_at.0, row.blob.sha256);
-    Ok(Json(PageBody::new(page, cursor, |row| row)))
+    PageBody::new(page, cursor, |row| row).answer(&request)
 }
 
 /// `GET /v1/blobs/{sha256}/content`: the bytes as they were sent, for the lab that sent them. No browser
@@ -134,14 +137,20 @@ pub(super) async fn content(
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
+    request: RequestContext,
 ) -> Result<StatusCode> {
+    let _guard = request.precondition(&app, body(&app, &access, sha256)).await?;
     app.store.delete_upload(&access.lab, sha256).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
 /// Takes one of the places for uploads and reserves room on the disk; refuses an upload that says by
 /// its length that it can't be taken, before its first byte.
-async fn begin(app: &App, access: &Access, headers: &HeaderMap) -> Result<(Place, Reservation)> {
+async fn begin(
+    app: &App,
+    access: &Access,
+    headers: &HeaderMap,
+) -> Result<(shares::Place, Reservation)> {
     check_encoding(headers)?;
     content_digest(headers)?;
     let slot = app.admission.place(&access.lab)?;
@@ -181,5 +190,5 @@ async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Respons
     let (blob, new) = app.store.store_upload(&access.lab, access.token, staged).await?;
     let status = if new { StatusCode::CREATED } else { StatusCode::OK };
     let location = [(header::LOCATION, format!("/v1/blobs/{}", blob.sha256))];
-    Ok((status, location, Json(blob)).into_response())
+    Ok((location, changed(status, &blob)?).into_response())
 }

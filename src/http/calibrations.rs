@@ -1,17 +1,15 @@
 //! `/v1/calibrations`: masks of optical settings.
 
-use axum::Json;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 use super::app::App;
-use super::conditional;
-use super::error::Result;
+use super::context::{RequestContext, changed};
+use super::error::{Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{Limit, PageBody, Renaming, ShowQuery};
-use super::submissions::{Stage, make, patience, pending};
+use super::page::{Cursor, Limit, NoQuery, PageBody, Renaming};
+use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
     CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Sha256, Submission, Timestamp,
 };
@@ -22,34 +20,46 @@ use store::{Asked, Calibration, Filter, Made, Page, Request, Span};
 pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
-    cursor: Option<CalibrationId>,
+    cursor: Option<Cursor<CalibrationId>>,
     created_after: Option<Timestamp>,
     created_before: Option<Timestamp>,
 }
 
-/// A calibration as it is shown. What is known of masks is null until they are there.
-#[derive(Debug, Serialize)]
+/// A calibration. Facts about masks are null until the masks are ready.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Calibration")]
 pub(super) struct CalibrationBody {
     id: CalibrationId,
     state: Stage,
-    /// How much of the work is done, in percent.
+    /// Share of the work that is done, in percent.
     percent: f64,
+    /// The failure in words.
     error: Option<String>,
-    /// The same as the problem with which the request would have been answered.
-    problem: Option<Value>,
+    /// The failure, as an answer to the request would have stated it.
+    problem: Option<Problem>,
     created_at: Timestamp,
     name: Option<Label>,
+    /// The file of the masks.
     masks: Option<Sha256>,
+    /// Format of the file.
     format: Option<String>,
+    /// Type of the samples in the file.
     sample: Option<String>,
+    /// Order of the axes of the array; null for pictures.
     axes: Option<String>,
+    /// Number of masks, the compression ratio B.
     frames: Option<usize>,
     height: Option<usize>,
     width: Option<usize>,
+    /// The stored number that means 1.
     full_scale: Option<f32>,
+    /// Mean of all masks, on [0, 1].
     mask_mean: Option<f64>,
+    /// Pixels that are dark in all masks.
     dead_pixels: Option<u64>,
+    /// Values at or below 0 that were set to 0.
     clipped_negatives: Option<u64>,
+    /// Colours of the pixels of the sensor; null for a grey sensor.
     mosaic: Option<Mosaic>,
 }
 
@@ -124,18 +134,18 @@ impl From<Asked<Calibration>> for CalibrationBody {
 
 pub(super) async fn create(
     Caller(app, access): Caller,
-    headers: HeaderMap,
+    asked: RequestContext,
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response> {
-    let key = request_key(&headers, &request)?;
+    let (key, wait) = (request_key(&asked.headers, &request)?, asked.wait());
     let request = Submission::Calibration(request);
-    let made = make(&app, &access, request, key.as_ref(), patience(&headers)).await?;
+    let made = make(&app, &access, request, key.as_ref(), wait.time(PATIENCE)).await?;
     let (status, id) = created(made);
     let body = body(&app, &access.lab, id).await?;
     let made = body.state == Stage::Ready;
     let status = if made { status } else { StatusCode::ACCEPTED };
     let location = [(header::LOCATION, format!("/v1/calibrations/{id}"))];
-    Ok((status, location, Json(body)).into_response())
+    Ok(wait.applied((location, changed(status, &body)?).into_response()))
 }
 
 async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody> {
@@ -145,44 +155,50 @@ async fn body(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationBody
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-    headers: HeaderMap,
+    request: RequestContext,
 ) -> Result<Response> {
     let limit = query.limit.get();
     let created = Span { from: query.created_after, before: query.created_before };
-    let filter = Filter { calibration: None, created, after: query.cursor };
+    let after = query.cursor.map(|Cursor(id)| id);
+    let filter = Filter { calibration: None, created, after };
     let page = app.store.calibrations(&access.lab, filter, limit).await?;
     let items: Vec<CalibrationBody> = page.items.into_iter().map(Into::into).collect();
     let id = |item: &CalibrationBody| item.id.to_string();
     let page = Page { items, more: page.more };
-    conditional::json(&PageBody::new(page, id, |item| item), &headers)
+    PageBody::new(page, id, |item| item).answer(&request)
 }
 
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
-    QueryOf(query): QueryOf<ShowQuery>,
-    headers: HeaderMap,
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
+    request: RequestContext,
 ) -> Result<Response> {
-    if let Some(time) = query.wait(&app) {
+    let wait = request.wait();
+    if let Some(time) = app.wait(wait) {
         let what = (Made::Calibration, id.into());
         app.events.settled(&app.store, &access.lab, what, time).await?;
     }
-    conditional::json(&body(&app, &access.lab, id).await?, &headers)
+    Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
 }
 
 pub(super) async fn rename(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
+    request: RequestContext,
     Body(renaming): Body<Renaming>,
-) -> Result<Json<CalibrationBody>> {
+) -> Result<Response> {
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.rename_calibration(&access.lab, id, renaming.name.as_ref()).await?;
-    Ok(Json(body(&app, &access.lab, id).await?))
+    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<CalibrationId>,
+    request: RequestContext,
 ) -> Result<StatusCode> {
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.delete_calibration(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -6,7 +6,6 @@ use axum::Json;
 use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use serde_json::Value;
 use strum::{EnumString, IntoStaticStr, VariantArray};
 
 use engine::intake::{IntakeError, Refusal, RefusalCode};
@@ -72,14 +71,19 @@ codes! {
     TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads at once", true;
     TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many requests wait", true;
     TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Enough files wait to be checked", true;
+    RateLimited: StatusCode::TOO_MANY_REQUESTS, "Too many requests", true;
     QueueFull: StatusCode::TOO_MANY_REQUESTS, "Enough jobs wait", true;
     Internal: StatusCode::INTERNAL_SERVER_ERROR, "The service has failed", true;
-    MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "The movie can't be made", false;
+    TaskFailed: StatusCode::INTERNAL_SERVER_ERROR, "A task has failed", true;
+    OutOfMemory: StatusCode::INTERNAL_SERVER_ERROR, "A worker ran out of memory", true;
+    WorkerCrashed: StatusCode::INTERNAL_SERVER_ERROR, "A worker crashed", true;
+    WorkerLost: StatusCode::INTERNAL_SERVER_ERROR, "Workers stopped too often", true;
+    MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "Movie can't be encoded", false;
     FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "The stored file is damaged", false;
     Unavailable: StatusCode::SERVICE_UNAVAILABLE, "The service can't serve this now", true;
     TimedOut: StatusCode::SERVICE_UNAVAILABLE, "The answer took too long", true;
     InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "The disk is full", true;
-    QuotaExceeded: StatusCode::INSUFFICIENT_STORAGE, "A limit is reached", false;
+    QuotaExceeded: StatusCode::FORBIDDEN, "A limit is reached", false;
 }
 
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
@@ -101,23 +105,38 @@ pub struct ApiError {
     headers: Vec<(HeaderName, HeaderValue)>,
 }
 
-#[derive(Debug, Serialize)]
-struct Problem<'a> {
+/// Names of all codes.
+fn codes() -> Vec<&'static str> {
+    Code::VARIANTS.iter().map(|code| code.into_str()).collect()
+}
+
+/// The body of an error (RFC 9457).
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+pub struct Problem {
+    /// A name of the code that holds everywhere. The header `Link` of an error leads to a page that explains it.
     r#type: String,
-    title: &'a str,
+    title: &'static str,
     status: u16,
-    detail: &'a str,
-    code: &'a str,
+    /// The fault, its place, and what to do.
+    detail: String,
+    /// Stable identifier, for programs to rely on.
+    #[schemars(extend("x-extensible-enum" = codes()))]
+    code: &'static str,
+    /// True if the same request may succeed later.
     retryable: bool,
+    /// The request, by its `X-Request-Id`.
     #[serde(skip_serializing_if = "Option::is_none")]
     instance: Option<String>,
+    /// With `invalid_content`, the fault of the file: `unknown_format`, `unsupported_content`, `truncated`, `malformed`,
+    /// `over_limit`, `missing_array`, `axes_ambiguous`, `no_axes`, `invalid_full_scale`, `not_finite`,
+    /// `above_full_scale`, `all_masks_zero`, `mask_frame_zero` or `snapshot_zero`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    reason: Option<&'a str>,
-    /// Where the first of `errors` stands, for programs that look at one.
+    reason: Option<String>,
+    /// JSON pointer to the first of `errors`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pointer: Option<&'a str>,
+    pointer: Option<String>,
     #[serde(skip_serializing_if = "<[_]>::is_empty")]
-    errors: &'a [InvalidField],
+    errors: Vec<InvalidField>,
 }
 
 impl ApiError {
@@ -159,22 +178,30 @@ impl ApiError {
     }
 
     /// The body of the answer.
-    pub(super) fn problem(&self) -> Value {
+    pub(super) fn problem(&self) -> Problem {
         let (status, title, retryable) = self.code.row();
         let code = self.code.into_str();
-        let problem = Problem {
-            r#type: format!("/problems/{code}"),
+        Problem {
+            r#type: format!("urn:sci-recon:problem:{code}"),
             title,
             status: status.as_u16(),
-            detail: &self.detail,
+            detail: self.detail.clone(),
             code,
             retryable: retryable && self.has_hope,
             instance: REQUEST_ID.try_with(|id| format!("urn:sci-recon:request:{id}")).ok(),
-            reason: self.reason.as_deref(),
-            pointer: self.errors.first().map(|error| error.pointer.as_str()),
-            errors: &self.errors,
-        };
-        serde_json::json!(problem)
+            reason: self.reason.clone(),
+            pointer: self.errors.first().map(|error| error.pointer.clone()),
+            errors: self.errors.clone(),
+        }
+    }
+
+    pub(super) fn code(&self) -> Code {
+        self.code
+    }
+
+    /// The reason of a job, which belongs to no request.
+    pub(super) fn problem_of_job(&self) -> Problem {
+        Problem { instance: None, ..self.problem() }
     }
 
     /// An error of ours: the log gets the cause, the user does not.
@@ -194,7 +221,13 @@ impl IntoResponse for ApiError {
         if retryable && (status == StatusCode::TOO_MANY_REQUESTS || status.is_server_error()) {
             headers.insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
         }
-        headers.extend(self.headers);
+        let page = format!("</problems/{}>; rel=\"help\"", self.code.into_str());
+        if let Ok(page) = HeaderValue::try_from(page) {
+            headers.insert(header::LINK, page);
+        }
+        for (name, value) in self.headers {
+            headers.insert(name, value);
+        }
         response
     }
 }
@@ -329,6 +362,10 @@ mod tests {
                 }
             }
         }
+        // Reasons of jobs are no answers.
+        let reasons = &contract["components"]["schemas"]["JobProblem"]["description"];
+        let reasons = named(reasons.as_str().unwrap());
+        documented.extend(reasons.map(|code| ("500".to_owned(), code)));
         // No operation has the status for a method that a path does not take.
         let about = contract["info"]["description"].as_str().unwrap();
         assert!(about.contains("405 (`method_not_allowed`)"));

@@ -5,11 +5,12 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::convert::Infallible;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::extract::State;
-use axum::http::HeaderName;
+use axum::http::{HeaderMap, HeaderName};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream;
@@ -38,11 +39,11 @@ const WAITERS: usize = 64;
 const MORE: &str = "\"more\":true";
 
 /// The data of an event.
-#[derive(Debug, Default, Serialize)]
-struct Change {
+#[derive(Debug, Default, Serialize, schemars::JsonSchema)]
+pub(super) struct Change {
     changed: Vec<String>,
     deleted: Vec<String>,
-    /// True if there are more than are named: read the list again.
+    /// True if more than these have changed: read the list again.
     more: bool,
 }
 
@@ -68,12 +69,16 @@ fn kind(what: Made) -> Kind {
     }
 }
 
-type Message = Arc<Told>;
+/// The events of all labs, with the number of the last change in them.
+type Message = (i64, Arc<Told>);
 
 /// The stream of changes to which listeners subscribe.
 #[derive(Debug, Clone)]
 pub(super) struct Events {
     sender: broadcast::Sender<Message>,
+    /// Number of the last change for which events were sent.
+    last: Arc<AtomicI64>,
+    store: Store,
     places: Places,
     waiters: Waiters,
     closing: CancellationToken,
@@ -83,10 +88,11 @@ impl Events {
     /// Begins to look, until `closing`.
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
-        let looking = look(store, sender.clone());
+        let last = Arc::default();
+        let looking = look(store.clone(), sender.clone(), Arc::clone(&last));
         tokio::spawn(closing.clone().run_until_cancelled_owned(looking));
         let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
-        Self { sender, places, waiters, closing }
+        Self { sender, last, store, places, waiters, closing }
     }
 }
 
@@ -143,7 +149,7 @@ impl Events {
             while !settled().await? {
                 loop {
                     match receiver.recv().await {
-                        Ok(changes) => {
+                        Ok((_, changes)) => {
                             let text = kind(&changes).get(lab);
                             if text.is_some_and(|text| text.contains(&name) || text.contains(MORE))
                             {
@@ -198,9 +204,8 @@ impl Drop for Waiter {
     }
 }
 
-async fn look(store: Store, sender: broadcast::Sender<Message>) {
-    // Number of the last change that needs no event.
-    let mut last = 0;
+/// Sends the changes; `last` is the number of the last one that needs no event.
+async fn look(store: Store, sender: broadcast::Sender<Message>, last: Arc<AtomicI64>) {
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
@@ -214,8 +219,8 @@ async fn look(store: Store, sender: broadcast::Sender<Message>) {
             tokio::time::sleep(LOOK).await;
         }
         let start = Instant::now();
-        match next(&store, &sender, last).await {
-            Ok(seen) => last = seen,
+        match next(&store, &sender, last.load(Ordering::Relaxed)).await {
+            Ok(seen) => last.store(seen, Ordering::Relaxed),
             // A failing database shows in every other answer, too.
             Err(error) => tracing::debug!(%error, "the changes can't be read"),
         }
@@ -237,7 +242,7 @@ async fn next(
     let changes = store.changes(last).await?;
     let seen = changes.last;
     // Fails only if the last listener has just left.
-    let _ = sender.send(message(store, changes).await?.into());
+    let _ = sender.send((seen, message(store, changes).await?.into()));
     Ok(seen)
 }
 
@@ -286,18 +291,27 @@ impl Change {
     }
 }
 
-pub(super) async fn listen(State(events): State<Events>, access: Access) -> Result<Response> {
+pub(super) async fn listen(
+    State(events): State<Events>,
+    access: Access,
+    headers: HeaderMap,
+) -> Result<Response> {
     let place = events.places.take(&access.lab).ok_or_else(|| {
         let detail = "all places for listeners are taken, or this lab has its share; poll instead";
         ApiError::new(Code::Unavailable, detail)
     })?;
-    let listener = Listener {
+    let mut listener = Listener {
         lab: access.lab,
+        // Before the changes are read, so that none falls between them.
         receiver: events.sender.subscribe(),
+        last: Arc::clone(&events.last),
+        seen: events.last.load(Ordering::Relaxed),
         closing: events.closing.clone(),
-        waiting: VecDeque::from([hello()]),
+        waiting: VecDeque::new(),
         _place: place,
     };
+    let seen = headers.get("last-event-id").and_then(|id| id.to_str().ok()?.parse().ok());
+    listener.start(&events.store, seen).await?;
     let events = stream::unfold(listener, Listener::next);
     // Proxies must not gather events into larger packets.
     let unbuffered: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
@@ -307,13 +321,31 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
 struct Listener {
     lab: Lab,
     receiver: broadcast::Receiver<Message>,
+    last: Arc<AtomicI64>,
+    /// Number of the last change that the listener knows.
+    seen: i64,
     closing: CancellationToken,
-    /// What it is told next.
+    /// Events to send next.
     waiting: VecDeque<Event>,
     _place: Place,
 }
 
 impl Listener {
+    /// Queues the changes after the one with the number `seen`, or the greeting if they are not known any longer.
+    async fn start(&mut self, store: &Store, seen: Option<i64>) -> Result<()> {
+        if let Some(seen) = seen {
+            let changes = store.changes(seen).await?;
+            if changes.items.is_some() {
+                let last = changes.last;
+                let message = message(store, changes).await?;
+                self.queue(last, &message);
+                return Ok(());
+            }
+        }
+        self.waiting.push_back(hello(self.seen));
+        Ok(())
+    }
+
     async fn next(mut self) -> Option<(Result<Event, Infallible>, Self)> {
         loop {
             if let Some(event) = self.waiting.pop_front() {
@@ -324,29 +356,42 @@ impl Listener {
                 () = self.closing.cancelled() => return None,
             };
             match received {
-                Ok(changes) => {
-                    let kinds = [
-                        ("jobs", &changes.jobs),
-                        ("calibrations", &changes.calibrations),
-                        ("measurements", &changes.measurements),
-                    ];
-                    for (name, told) in kinds {
-                        let text = told.get(&self.lab);
-                        self.waiting
-                            .extend(text.map(|text| Event::default().event(name).data(text)));
-                    }
-                }
-                // A slow listener has missed some: it must read the list again.
+                Ok((number, changes)) if number > self.seen => self.queue(number, &changes),
+                Ok(_) => {}
+                // A slow listener has missed some changes: it must read the lists again.
                 Err(broadcast::error::RecvError::Lagged(_)) => {
-                    self.waiting.push_back(hello());
+                    self.receiver = self.receiver.resubscribe();
+                    self.seen = self.last.load(Ordering::Relaxed);
+                    self.waiting.push_back(hello(self.seen));
                 }
                 Err(broadcast::error::RecvError::Closed) => return None,
             }
         }
     }
+
+    /// Queues the events of the lab. The last one has the number: a connection that breaks between them gets all of
+    /// them again.
+    fn queue(&mut self, number: i64, changes: &Told) {
+        self.seen = number;
+        let kinds = [
+            ("jobs", &changes.jobs),
+            ("calibrations", &changes.calibrations),
+            ("measurements", &changes.measurements),
+        ];
+        let mut events: Vec<Event> = kinds
+            .into_iter()
+            .filter_map(|(name, labs)| {
+                Some(Event::default().event(name).data(labs.get(&self.lab)?))
+            })
+            .collect();
+        if let Some(last) = events.pop() {
+            events.push(last.id(number.to_string()));
+        }
+        self.waiting.extend(events);
+    }
 }
 
-/// Has a listener read the lists.
-fn hello() -> Event {
-    Event::default().event("hello").data("{}")
+/// Has a listener read the lists, which are at least as new as the change with this number.
+fn hello(number: i64) -> Event {
+    Event::default().event("hello").data("{}").id(number.to_string())
 }

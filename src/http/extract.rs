@@ -13,6 +13,7 @@ use serde::de::DeserializeOwned;
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
+use super::strict::Strict;
 use engine::job::{InvalidField, Sha256};
 use store::{Inserted, RequestKey};
 
@@ -155,7 +156,7 @@ fn unreadable(error: BytesRejection) -> ApiError {
 
 fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T> {
     let mut deserializer = serde_json::Deserializer::from_slice(bytes);
-    let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {
+    let value = serde_path_to_error::deserialize(Strict(&mut deserializer)).map_err(|error| {
         let pointer = pointer(error.path());
         let inner = error.into_inner();
         if inner.is_data() {

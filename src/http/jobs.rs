@@ -11,21 +11,27 @@ use strum::VariantArray;
 
 use super::access::Access;
 use super::app::App;
-use super::conditional;
-use super::error::{ApiError, Code, Result};
+use super::context::{RequestContext, changed};
+use super::error::{ApiError, Code, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{Limit, PageBody, ShowQuery};
+use super::page::{Cursor, Limit, NoQuery, PageBody};
+use super::problems;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Finding, FindingCode, InvalidField, JobId, JobRequest,
     JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule,
     Sequence, SnapshotRange, TileSpec, Timestamp, priority_error,
 };
 use store::{
-    Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, Made, NewJob, Page, RequestKey,
-    Span, StoreError,
+    Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
+    NewJob, Page, RequestKey, Span, StoreError,
 };
 
-#[derive(Debug, Serialize)]
+/// The longest pause that a refused client is asked to make, in seconds.
+const LONGEST_PAUSE: f64 = 600.0;
+
+/// A job with its progress.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Job")]
 pub(super) struct JobBody {
     id: JobId,
     lab: Lab,
@@ -38,18 +44,59 @@ pub(super) struct JobBody {
     sequence: Sequence,
     run: RunSpec,
     algorithm: Algorithm,
-    /// The network of `learned`; null for all others.
+    /// The model of algorithm `learned`; null for other algorithms.
     model: Option<ModelId>,
     schedule: Schedule,
     tile: TileSpec,
     priority: i32,
+    /// Findings of the check of the measurement, and `bad_calibration`.
     warnings: Vec<Finding>,
+    /// The failure in words.
     error: Option<String>,
+    /// The failure with its place.
+    problem: Option<JobProblem>,
     created_at: Timestamp,
     started_at: Option<Timestamp>,
     finished_at: Option<Timestamp>,
+    /// Predicted quality of the frames, mean over the snapshots. Null until the job has succeeded, and where no prediction
+    /// is possible: colour sensors, models of users, and schedules without a quality model.
     assessment: Option<Assessment>,
     progress: JobProgress,
+}
+
+/// The failure of a job. Codes are `task_failed`, `out_of_memory`, `worker_crashed` and `worker_lost`.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+struct JobProblem {
+    #[serde(flatten)]
+    problem: Problem,
+    /// The kind of the task that failed.
+    stage: Option<&'static str>,
+    /// The snapshot of the task, or the first of its run.
+    snapshot: Option<u32>,
+    tile: Option<u32>,
+    /// Attempts at the task.
+    attempts: Option<u32>,
+    /// Instruction for the user.
+    remedy: &'static str,
+}
+
+impl JobProblem {
+    fn new(error: &str, task: Option<FailedTask>) -> Self {
+        let code = task.as_ref().map_or(Code::TaskFailed, |task| match task.cause {
+            FailureCause::Task => Code::TaskFailed,
+            FailureCause::Memory => Code::OutOfMemory,
+            FailureCause::Crash => Code::WorkerCrashed,
+            FailureCause::Loss => Code::WorkerLost,
+        });
+        Self {
+            problem: ApiError::new(code, error).problem_of_job(),
+            stage: task.as_ref().map(|task| task.kind.into_str()),
+            snapshot: task.as_ref().and_then(|task| task.kind.snapshot()),
+            tile: task.as_ref().and_then(|task| task.kind.tile()),
+            attempts: task.map(|task| task.attempts),
+            remedy: problems::meaning(code),
+        }
+    }
 }
 
 impl JobBody {
@@ -58,9 +105,15 @@ impl JobBody {
         format!("/v1/jobs/{}", self.id)
     }
 
-    fn new(job: Job, progress: JobProgress) -> Self {
+    async fn new(app: &App, job: Job, progress: JobProgress) -> Result<Self> {
+        let problem = match &job.error {
+            Some(error) if job.state == JobState::Failed => {
+                Some(JobProblem::new(error, app.store.failed_task(job.id).await?))
+            }
+            _ => None,
+        };
         let spec = job.spec;
-        Self {
+        Ok(Self {
             id: job.id,
             lab: job.lab,
             state: job.state,
@@ -78,12 +131,13 @@ impl JobBody {
             priority: spec.priority,
             warnings: spec.warnings,
             error: job.error,
+            problem,
             created_at: job.created_at,
             started_at: job.started_at,
             finished_at: job.finished_at,
             assessment: job.assessment,
             progress,
-        }
+        })
     }
 }
 
@@ -92,7 +146,7 @@ impl JobBody {
 pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
-    cursor: Option<JobId>,
+    cursor: Option<Cursor<JobId>>,
     state: Option<States>,
     calibration: Option<CalibrationId>,
     measurement: Option<MeasurementId>,
@@ -122,28 +176,35 @@ impl FromStr for States {
     }
 }
 
-/// What a user changes of a job: what is left out stays.
+/// Changes of a job. Omitted fields keep their values.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "JobChanges")]
 pub(super) struct Changes {
-    /// Null takes it away.
+    /// Null removes the label.
     #[serde(default, with = "serde_with::rust::double_option")]
+    #[schemars(with = "Option<Label>")]
     label: Option<Option<Label>>,
+    /// From -100 to 100; above 0 with the role admin alone.
+    #[schemars(range(min = -100, max = 100))]
     priority: Option<i32>,
 }
 
-/// What a job would take.
-#[derive(Debug, Serialize)]
+/// Predicted cost of a job.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Estimate")]
 pub(super) struct EstimateBody {
+    /// Tiles of all snapshots.
     tiles: u64,
     tasks: usize,
-    /// Planned processor seconds.
+    /// Planned CPU seconds.
     cpu_seconds: f64,
     #[serde(flatten)]
     forecast: Estimate,
-    /// The most that it writes to the disk.
+    /// Largest number of bytes that the job writes to the disk.
     disk_bytes: u64,
-    /// The most memory that a worker needs.
+    /// Largest memory that a worker needs.
     worker_memory_bytes: u64,
     warnings: Vec<Finding>,
 }
@@ -156,7 +217,7 @@ pub(super) async fn create(
     let key = request_key(&headers, &request)?;
     let (status, body) = make(&app, &access, request, key).await?;
     let location = [(header::LOCATION, body.place())];
-    Ok((status, location, Json(body)).into_response())
+    Ok((location, changed(status, &body)?).into_response())
 }
 
 /// Makes a job, or finds the one that was made with the same key.
@@ -185,7 +246,20 @@ async fn insert(
     let lab = access.lab.clone();
     let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
     let new = NewJob { most_jobs, lab, spec, key };
-    app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new)).await
+    let place = app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new));
+    match place.await {
+        Err(full) if full.code() == Code::QueueFull => {
+            Err(full.with_header(header::RETRY_AFTER, next_end(app).await?.into()))
+        }
+        inserted => inserted,
+    }
+}
+
+/// Estimated seconds until a job ends: the time for all jobs, divided by their number.
+async fn next_end(app: &App) -> Result<u64> {
+    let Estimate { eta_seconds, queue_position } = app.store.estimate(&[]).await?;
+    let seconds = eta_seconds.unwrap_or(LONGEST_PAUSE) / queue_position.max(1) as f64;
+    Ok(seconds.clamp(1.0, LONGEST_PAUSE).ceil() as u64)
 }
 
 /// Checks a request against the measurement that it names.
@@ -272,7 +346,7 @@ fn check_networks(app: &App, spec: &JobSpec) -> Result<()> {
 async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody> {
     let job = app.store.job(lab, id).await?;
     let progress = app.store.progress(&job).await?;
-    let mut bodies = [JobBody::new(job, progress)];
+    let mut bodies = [JobBody::new(app, job, progress).await?];
     warn_of_tiles(app, &mut bodies).await?;
     let [body] = bodies;
     Ok(body)
@@ -299,7 +373,7 @@ async fn warn_of_tiles(app: &App, jobs: &mut [JobBody]) -> Result<()> {
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-    headers: HeaderMap,
+    request: RequestContext,
 ) -> Result<Response> {
     let filter = JobFilter {
         states: query.state.map(|States(states)| states),
@@ -308,45 +382,48 @@ pub(super) async fn list(
         label: query.label,
         search: query.search,
         created: Span { from: query.created_after, before: query.created_before },
-        after: query.cursor,
+        after: query.cursor.map(|Cursor(id)| id),
     };
     let page = app.store.jobs(access.shown(), &filter, query.limit.get()).await?;
     let progress = app.store.progress_of(&page.items).await?;
-    let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
-    let mut page = Page { items: items.collect::<Vec<_>>(), more: page.more };
-    warn_of_tiles(&app, &mut page.items).await?;
-    conditional::json(
-        &PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item),
-        &headers,
-    )
+    let mut items = Vec::new();
+    for (job, at) in page.items.into_iter().zip(progress) {
+        items.push(JobBody::new(&app, job, at).await?);
+    }
+    warn_of_tiles(&app, &mut items).await?;
+    let page = Page { items, more: page.more };
+    PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item).answer(&request)
 }
 
 /// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    QueryOf(query): QueryOf<ShowQuery>,
-    headers: HeaderMap,
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
+    request: RequestContext,
 ) -> Result<Response> {
-    if let Some(time) = query.wait(&app) {
+    let wait = request.wait();
+    if let Some(time) = app.wait(wait) {
         app.events.ended(&app.store, &access.lab, id, time).await?;
     }
-    conditional::json(&body(&app, &access.lab, id).await?, &headers)
+    Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
 }
 
 /// `PATCH /v1/jobs/{job}`.
 pub(super) async fn change(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
+    request: RequestContext,
     Body(changes): Body<Changes>,
-) -> Result<Json<JobBody>> {
+) -> Result<Response> {
     let Changes { label, priority } = changes;
     let wrong = priority.and_then(|to| priority_error(to).or_else(|| role_error(&access, to)));
     if let Some(error) = wrong {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.change_job(&access.lab, id, &JobChanges { label, priority }).await?;
-    Ok(Json(body(&app, &access.lab, id).await?))
+    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 
 /// `POST /v1/jobs/estimate`: what a job would take, which is checked as one that is meant.
@@ -371,9 +448,9 @@ pub(super) async fn estimate(
 pub(super) async fn cancel(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    headers: HeaderMap,
+    request: RequestContext,
 ) -> Result<Response> {
-    check_match(&app, &access.lab, id, &headers).await?;
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.cancel_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
@@ -381,32 +458,25 @@ pub(super) async fn cancel(
 pub(super) async fn retry(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    headers: HeaderMap,
+    request: RequestContext,
 ) -> Result<Response> {
-    check_match(&app, &access.lab, id, &headers).await?;
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.retry_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
 
-/// Refuses a change of a job that the client has seen in another state.
-async fn check_match(app: &App, lab: &Lab, id: JobId, headers: &HeaderMap) -> Result<()> {
-    if !headers.contains_key(header::IF_MATCH) {
-        return Ok(());
-    }
-    conditional::check_match(headers, &conditional::etag_of(&body(app, lab, id).await?)?)
-}
-
 async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response> {
     let retry_after: (HeaderName, &str) = (header::RETRY_AFTER, "1");
-    Ok((StatusCode::ACCEPTED, [retry_after], Json(body(app, lab, id).await?)).into_response())
+    let answer = changed(StatusCode::ACCEPTED, &body(app, lab, id).await?)?;
+    Ok(([retry_after], answer).into_response())
 }
 
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    headers: HeaderMap,
+    request: RequestContext,
 ) -> Result<StatusCode> {
-    check_match(&app, &access.lab, id, &headers).await?;
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -1,16 +1,20 @@
 //! What happens to every request around its handler.
 
 use std::any::Any;
+use std::convert::Infallible;
 use std::time::Instant;
 
-use axum::extract::{MatchedPath, Request};
+use axum::extract::{MatchedPath, OriginalUri, Request};
 use axum::http::{HeaderName, HeaderValue, Method, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use tower::{Layer, Service, ServiceExt, service_fn};
+use tower_http::cors::CorsLayer;
 use tracing::Instrument;
 use tracing::field::Empty;
 use uuid::Uuid;
 
+use super::context::relative;
 use super::error::{ApiError, Code, REQUEST_ID};
 use super::metrics;
 
@@ -68,6 +72,87 @@ fn is_plain(id: &HeaderValue) -> bool {
 fn new_id() -> HeaderValue {
     let text = Uuid::now_v7().to_string();
     HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static("unknown"))
+}
+
+/// Makes references in headers relative to the address of the request, so that they hold below any prefix that a proxy
+/// adds. Handlers name paths of the service.
+pub(super) async fn relative_references(mut request: Request, next: Next) -> Response {
+    let known = request.extensions().get::<OriginalUri>().map(|OriginalUri(uri)| uri.clone());
+    let uri = known.unwrap_or_else(|| request.uri().clone());
+    request.extensions_mut().insert(OriginalUri(uri.clone()));
+    let mut response = next.run(request).await;
+    let fields = response.headers_mut();
+    for name in [header::LOCATION, header::CONTENT_LOCATION] {
+        let Some(target) = fields.get(&name).and_then(|value| value.to_str().ok()) else {
+            continue;
+        };
+        if let Ok(value) = HeaderValue::try_from(relative(uri.path(), target)) {
+            fields.insert(name, value);
+        }
+    }
+    let link = fields.get(header::LINK).and_then(|link| link.to_str().ok());
+    if let Some((target, rest)) = link.and_then(|link| link.strip_prefix("</")?.split_once('>')) {
+        let target = relative(uri.path(), &format!("/{target}"));
+        if let Ok(value) = HeaderValue::try_from(format!("<{target}>{rest}")) {
+            fields.insert(header::LINK, value);
+        }
+    }
+    response
+}
+
+/// Headers of answers that pages of other origins may read.
+pub(super) fn exposed() -> Vec<HeaderName> {
+    let tus = [
+        "tus-resumable",
+        "tus-version",
+        "tus-extension",
+        "tus-max-size",
+        "tus-checksum-algorithm",
+        "upload-offset",
+        "upload-length",
+        "upload-defer-length",
+        "upload-metadata",
+        "upload-expires",
+    ];
+    let others = ["preference-applied", "ratelimit", "ratelimit-policy"];
+    let own = tus.into_iter().chain(others).map(HeaderName::from_static);
+    let known = [
+        header::LOCATION,
+        header::CONTENT_LOCATION,
+        header::ETAG,
+        header::CONTENT_RANGE,
+        header::ACCEPT_RANGES,
+        header::CONTENT_DISPOSITION,
+        header::LINK,
+        header::RETRY_AFTER,
+        HEADER,
+    ];
+    own.chain(known).collect()
+}
+
+/// Adds the headers of CORS. An OPTIONS that is no preflight, as those of tus, goes to its handler.
+pub(super) fn cors<S>(
+    cors: CorsLayer,
+    service: S,
+) -> impl Service<Request, Response = Response, Error = Infallible, Future: Send>
++ Clone
++ Send
++ Sync
++ 'static
+where
+    S: Service<Request, Response = Response, Error = Infallible, Future: Send>
+        + Clone
+        + Send
+        + Sync
+        + 'static,
+{
+    let open = cors.layer(service.clone());
+    service_fn(move |request: Request| {
+        let is_plain = request.method() == Method::OPTIONS
+            && !request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
+        let (open, plain) = (open.clone(), service.clone());
+        async move { if is_plain { plain.oneshot(request).await } else { open.oneshot(request).await } }
+    })
 }
 
 /// Refuses a request that names two hosts, or none: a proxy before us and we may take it for different ones

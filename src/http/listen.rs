@@ -1,11 +1,15 @@
 //! The connections: how many there may be, how long they may be silent, and how slow.
 
 use std::collections::HashMap;
+use std::convert::Infallible;
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::Router;
+use axum::response::Response;
+use hyper::Request;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
@@ -13,6 +17,7 @@ use hyper_util::service::TowerToHyperService;
 use rustix::process::{Resource, getrlimit, setrlimit};
 use socket2::SockRef;
 use tokio::net::{TcpListener, TcpStream};
+use tower::ServiceExt;
 
 use super::write_deadline::{LeastRate, WriteDeadline};
 use crate::config::ServeArguments;
@@ -38,7 +43,8 @@ pub async fn listen(
     let (rate, time) = (settings.download_bytes_per_second, settings.download_stall());
     let least = LeastRate { bytes: rate.saturating_mul(time.as_secs()), time };
     let places = Places::new(raise_file_limit());
-    let service = TowerToHyperService::new(router);
+    let service = ServiceExt::<Request<Incoming>>::map_result(router, cut);
+    let service = TowerToHyperService::new(service);
     let mut http = http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(SILENCE);
     let graceful = GracefulShutdown::new();
@@ -71,6 +77,26 @@ pub async fn listen(
     }
     drop(listener);
     graceful.shutdown().await;
+}
+
+/// Marks an answer whose connection ends in place of it.
+#[derive(Debug, Clone, Copy, thiserror::Error)]
+#[error("the connection is closed without an answer")]
+pub(super) struct Cut;
+
+impl From<Infallible> for Cut {
+    fn from(never: Infallible) -> Self {
+        match never {}
+    }
+}
+
+/// An error makes hyper close the connection.
+fn cut(answer: Result<Response, Infallible>) -> Result<Response, Cut> {
+    let Ok(response) = answer;
+    match response.extensions().get::<Cut>() {
+        Some(cut) => Err(*cut),
+        None => Ok(response),
+    }
 }
 
 fn io(stream: TcpStream, least: LeastRate) -> TokioIo<WriteDeadline<TcpStream>> {

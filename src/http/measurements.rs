@@ -1,45 +1,53 @@
 //! `/v1/measurements`: coded snapshots.
 
-use axum::Json;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use serde_json::Value;
 
 use super::app::App;
-use super::error::{ApiError, Result};
+use super::context::{RequestContext, changed};
+use super::error::{ApiError, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{ListQuery, PageBody, Renaming, ShowQuery};
-use super::submissions::{Stage, make, patience, pending};
+use super::page::{ListQuery, NoQuery, PageBody, Renaming};
+use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
     CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Sequence, Sha256,
     Submission, Timestamp,
 };
 use store::{Asked, Made, Measurement, Page, Request, StoreError};
 
-/// A measurement as it is shown. What is known of its data is null until they are checked.
-#[derive(Debug, Serialize)]
+/// A measurement. Facts about its data are null until they are checked.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Measurement")]
 pub(super) struct MeasurementBody {
     id: MeasurementId,
     state: Stage,
+    /// The failure in words.
     error: Option<String>,
-    /// The same as the problem with which the request would have been answered.
-    problem: Option<Value>,
+    /// The failure, as an answer to the request would have stated it.
+    problem: Option<Problem>,
     created_at: Timestamp,
     name: Option<Label>,
     calibration: CalibrationId,
     data: Sha256,
+    /// Format of the file.
     format: Option<String>,
+    /// Type of the samples in the file.
     sample: Option<String>,
+    /// Order of the axes of the array; null for pictures.
     axes: Option<String>,
     snapshots: Option<u32>,
     height: Option<usize>,
     width: Option<usize>,
+    /// The stored number that means 1.
     full_scale: Option<f32>,
+    /// Snapshots per second.
     camera_fps: Option<f64>,
+    /// Exposure of a snapshot in seconds.
     exposure_s: Option<f64>,
     sequence: Option<Sequence>,
     dark: Vec<Sha256>,
+    /// Findings of the check against the calibration. Every job of the measurement repeats them.
     warnings: Vec<Finding>,
 }
 
@@ -118,17 +126,17 @@ impl TryFrom<Asked<Measurement>> for MeasurementBody {
 
 pub(super) async fn create(
     Caller(app, access): Caller,
-    headers: HeaderMap,
+    asked: RequestContext,
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response> {
-    let key = request_key(&headers, &request)?;
+    let (key, wait) = (request_key(&asked.headers, &request)?, asked.wait());
     let request = Submission::Measurement(request);
-    let made = make(&app, &access, request, key.as_ref(), patience(&headers)).await?;
+    let made = make(&app, &access, request, key.as_ref(), wait.time(PATIENCE)).await?;
     let (status, id) = created(made);
     let body = body(&app, &access.lab, id).await?;
     let status = if body.state == Stage::Ready { status } else { StatusCode::ACCEPTED };
     let location = [(header::LOCATION, format!("/v1/measurements/{id}"))];
-    Ok((status, location, Json(body)).into_response())
+    Ok(wait.applied((location, changed(status, &body)?).into_response()))
 }
 
 async fn body(app: &App, lab: &Lab, id: MeasurementId) -> Result<MeasurementBody> {
@@ -138,39 +146,46 @@ async fn body(app: &App, lab: &Lab, id: MeasurementId) -> Result<MeasurementBody
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery<MeasurementId>>,
-) -> Result<Json<PageBody<MeasurementBody>>> {
+    request: RequestContext,
+) -> Result<Response> {
     let (limit, filter) = (query.limit.get(), query.filter());
     let Page { items, more } = app.store.measurements(&access.lab, filter, limit).await?;
     let items = items.into_iter().map(TryInto::try_into);
     let items: Vec<MeasurementBody> = items.collect::<Result<_>>()?;
-    Ok(Json(PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item)))
+    PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item).answer(&request)
 }
 
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
-    QueryOf(query): QueryOf<ShowQuery>,
-) -> Result<Json<MeasurementBody>> {
-    if let Some(time) = query.wait(&app) {
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
+    request: RequestContext,
+) -> Result<Response> {
+    let wait = request.wait();
+    if let Some(time) = app.wait(wait) {
         let what = (Made::Measurement, id.into());
         app.events.settled(&app.store, &access.lab, what, time).await?;
     }
-    Ok(Json(body(&app, &access.lab, id).await?))
+    Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
 }
 
 pub(super) async fn rename(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
+    request: RequestContext,
     Body(renaming): Body<Renaming>,
-) -> Result<Json<MeasurementBody>> {
+) -> Result<Response> {
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.rename_measurement(&access.lab, id, renaming.name.as_ref()).await?;
-    Ok(Json(body(&app, &access.lab, id).await?))
+    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<MeasurementId>,
+    request: RequestContext,
 ) -> Result<StatusCode> {
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.delete_measurement(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -2,15 +2,16 @@
 
 use std::time::Duration;
 
-use axum::Json;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 
+use super::app::App;
+use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{ListQuery, PageBody, Renaming};
 use super::submissions::make;
-use engine::job::{ModelId, ModelRequest, Submission};
+use engine::job::{Lab, ModelId, ModelRequest, Submission};
 use store::{Model, StoreError};
 
 /// How long a request waits for the check of a network, which may wait for others. It has no state to be asked for.
@@ -33,38 +34,48 @@ pub(super) async fn create(
         }
         error => error.into(),
     })?;
-    Ok((status, location, Json(model)).into_response())
+    Ok((location, changed(status, &model)?).into_response())
 }
 
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery<ModelId>>,
-) -> Result<Json<PageBody<Model>>> {
+    request: RequestContext,
+) -> Result<Response> {
     let limit = query.limit.get();
     let page = app.store.models(&access.lab, query.filter(), limit).await?;
-    Ok(Json(PageBody::new(page, |item| item.id.to_string(), |item| item)))
+    PageBody::new(page, |item| item.id.to_string(), |item| item).answer(&request)
 }
 
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<ModelId>,
-) -> Result<Json<Model>> {
-    Ok(Json(app.store.model(&access.lab, id).await?))
+    request: RequestContext,
+) -> Result<Response> {
+    request.json(&body(&app, &access.lab, id).await?)
+}
+
+async fn body(app: &App, lab: &Lab, id: ModelId) -> Result<Model> {
+    Ok(app.store.model(lab, id).await?)
 }
 
 pub(super) async fn rename(
     Caller(app, access): Caller,
     Params(id): Params<ModelId>,
+    request: RequestContext,
     Body(renaming): Body<Renaming>,
-) -> Result<Json<Model>> {
+) -> Result<Response> {
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.rename_model(&access.lab, id, renaming.name.as_ref()).await?;
-    Ok(Json(app.store.model(&access.lab, id).await?))
+    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<ModelId>,
+    request: RequestContext,
 ) -> Result<StatusCode> {
+    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
     app.store.delete_model(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -1,10 +1,15 @@
 //! Pages of lists, and queries that several kinds of things share.
 
-use std::time::Duration;
+use std::str::FromStr;
 
+use axum::response::Response;
+use base64::Engine;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use serde::{Deserialize, Serialize};
+use serde_with::DeserializeFromStr;
 
-use super::app::App;
+use super::context::RequestContext;
+use super::error::ApiError;
 use engine::job::{CalibrationId, Label, Timestamp};
 use store::{Filter, Page, Span};
 
@@ -43,11 +48,11 @@ impl Limit {
 
 /// The query of a list of things that belong to calibrations.
 #[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, bound = "Id: FromStr")]
 pub(super) struct ListQuery<Id> {
     #[serde(default)]
     pub(super) limit: Limit,
-    pub(super) cursor: Option<Id>,
+    pub(super) cursor: Option<Cursor<Id>>,
     pub(super) calibration: Option<CalibrationId>,
     pub(super) created_after: Option<Timestamp>,
     pub(super) created_before: Option<Timestamp>,
@@ -56,63 +61,63 @@ pub(super) struct ListQuery<Id> {
 impl<Id> ListQuery<Id> {
     pub(super) fn filter(self) -> Filter<Id> {
         let created = Span { from: self.created_after, before: self.created_before };
-        Filter { calibration: self.calibration, created, after: self.cursor }
+        let after = self.cursor.map(|Cursor(id)| id);
+        Filter { calibration: self.calibration, created, after }
     }
 }
 
-/// The query of something that comes to an end.
+/// The query of a route without parameters.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ShowQuery {
-    #[serde(default)]
-    wait: Wait,
-}
+pub(super) struct NoQuery {}
 
-impl ShowQuery {
-    /// How long to wait; none for not at all.
-    pub(super) fn wait(&self, app: &App) -> Option<Duration> {
-        // A proxy, or the limit on the time of answers, must not come first.
-        let longest = app.settings.request_time() / 2;
-        (self.wait.0 > 0.0).then(|| Duration::from_secs_f64(self.wait.0).min(longest))
+/// The place in a list after which a page begins. Clients see opaque text.
+#[derive(Debug, Clone, Copy, DeserializeFromStr)]
+pub(super) struct Cursor<T>(pub(super) T);
+
+impl<T: FromStr> FromStr for Cursor<T> {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let bytes = URL_SAFE_NO_PAD.decode(text).ok();
+        let place = bytes.and_then(|bytes| String::from_utf8(bytes).ok()?.parse().ok());
+        place.map(Self).ok_or("cursor is none of this list: take it from next_cursor")
     }
 }
 
-/// Seconds to wait for the end of what is shown, on 0 to 20.
-#[derive(Debug, Clone, Copy, Default, Deserialize)]
-#[serde(try_from = "f64")]
-struct Wait(f64);
-
-impl TryFrom<f64> for Wait {
-    type Error = String;
-
-    fn try_from(seconds: f64) -> Result<Self, String> {
-        if (0.0..=20.0).contains(&seconds) {
-            return Ok(Self(seconds));
-        }
-        Err(format!("wait is {seconds}; it must be from 0 to 20 seconds"))
-    }
-}
-
-/// The body of a request that gives a thing another name, or none.
+/// The new name of a resource; null removes the name.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(extend("required" = ["name"]))]
 pub(super) struct Renaming {
-    /// Needed: that it is left out is more likely to be a mistake.
+    /// Required, because an omitted name is more likely a mistake.
     #[serde(deserialize_with = "Option::deserialize")]
     pub(super) name: Option<Label>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "{T}Page")]
 pub(super) struct PageBody<T> {
     items: Vec<T>,
-    /// What to send as `cursor` for the next page; null on the last one.
+    /// Cursor of the next page; null on the last page.
     next_cursor: Option<String>,
 }
 
-impl<T> PageBody<T> {
-    /// The page with its items as they are shown; `id` gives the cursor after an item.
-    pub(super) fn new<R>(page: Page<R>, id: impl Fn(&R) -> String, show: impl Fn(R) -> T) -> Self {
-        let next_cursor = if page.more { page.items.last().map(id) } else { None };
+impl<T: Serialize> PageBody<T> {
+    /// Converts a page of records with `show`; `place` gives the cursor after a record.
+    pub(super) fn new<R>(
+        page: Page<R>,
+        place: impl Fn(&R) -> String,
+        show: impl Fn(R) -> T,
+    ) -> Self {
+        let last = page.items.last().filter(|_| page.more);
+        let next_cursor = last.map(|item| URL_SAFE_NO_PAD.encode(place(item)));
         Self { items: page.items.into_iter().map(show).collect(), next_cursor }
+    }
+
+    /// The answer, with the link to the next page.
+    pub(super) fn answer(&self, request: &RequestContext) -> Result<Response, ApiError> {
+        request.page(self, self.next_cursor.as_deref())
     }
 }

@@ -49,7 +49,7 @@ fn page(code: Code) -> String {
 }
 
 /// What it means, and what to do.
-fn meaning(code: Code) -> &'static str {
+pub(super) fn meaning(code: Code) -> &'static str {
     match code {
         Code::MalformedJson => "The body is no JSON. The detail has line and column.",
         Code::MalformedRequest => {
@@ -126,14 +126,27 @@ fn meaning(code: Code) -> &'static str {
         Code::TooManyChecks => {
             "So many files of the lab wait to be checked that this one may not. Come back when some are done."
         }
+        Code::RateLimited => {
+            "The token has sent more requests than it may in a minute. Continue after Retry-After seconds."
+        }
         Code::QueueFull => {
             "So many jobs wait that no more are taken. Come back later, or cancel some."
         }
         Code::Internal => {
             "The log of the service has the cause, under the identifier of the request."
         }
+        Code::TaskFailed => "Mend the cause that the detail names, then retry the job.",
+        Code::OutOfMemory => {
+            "Use smaller tiles, fewer workers or a machine with more memory, then retry the job."
+        }
+        Code::WorkerCrashed => {
+            "Retry the job. If the worker crashes again, report it with the log of the service."
+        }
+        Code::WorkerLost => {
+            "Workers were killed or fell silent. See that they keep running, then retry the job."
+        }
         Code::MovieFailed => {
-            "A worker has tried three times; the detail has its reason. Asked for again, it is tried again."
+            "A worker has tried three times; the detail has its reason. Create the movie again for another try."
         }
         Code::FileDamaged => {
             "The disk of the service has lost or changed the file; no byte of it is sent. Retry its job, and it \

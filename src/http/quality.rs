@@ -27,8 +27,9 @@ pub(super) struct QualityQuery {
     axes: Option<Axes>,
 }
 
-#[derive(Debug, Serialize)]
-struct QualityBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "QualityReport")]
+pub(super) struct QualityBody {
     truth: Sha256,
     #[serde(flatten)]
     quality: Quality,

@@ -1,4 +1,4 @@
-//! `/v1/calibrations/{calibration}/report.json`, `report.html` and `maps/{name}.png`.
+//! The report of a calibration: as JSON for clients, as a page with maps for people.
 
 use axum::http::{HeaderMap, header};
 use axum::response::Response;

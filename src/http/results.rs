@@ -1,104 +1,112 @@
-//! Results: frames, stacks and manifests of a job, with ETag and Range.
+//! Snapshots of a job and their stored files, which [`exports`](super::exports) serves with ETag and Range.
 
 use std::path::PathBuf;
 
-use axum::Json;
-use axum::http::{HeaderMap, Method, Uri};
+use axum::http::{HeaderMap, Method};
 use axum::response::Response;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::app::App;
+use super::context::RequestContext;
 use super::download::Download;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Caller, Params};
+use super::extract::{Caller, Params, QueryOf};
 use super::jobs::with_snapshot;
+use super::page::{Cursor, Limit, PageBody};
 use engine::job::{JobId, JobState, ResultFile};
-use store::{Job, StoreError};
+use store::{Job, Page, StoreError};
 
-#[derive(Debug, Serialize)]
+/// A snapshot of a job, with its files.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "SnapshotFiles")]
 pub(super) struct SnapshotBody {
     snapshot: u32,
-    /// True once the files are there.
+    /// True once the files exist.
     ready: bool,
     files: Vec<FileBody>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "SnapshotFile")]
 struct FileBody {
     #[serde(flatten)]
     file: ResultFile,
-    /// Where it is downloaded from, if it is.
+    /// Address of the file, relative to the address of this answer.
     href: Option<String>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ListQuery {
+    #[serde(default)]
+    limit: Limit,
+    cursor: Option<Cursor<u32>>,
+}
+
+/// `GET /v1/jobs/{job}/snapshots`: the snapshots of a job, by index.
+pub(super) async fn list(
+    Caller(app, access): Caller,
+    Params(id): Params<JobId>,
+    QueryOf(query): QueryOf<ListQuery>,
+    request: RequestContext,
+) -> Result<Response> {
+    let job = app.store.job(&access.lab, id).await?;
+    let after = query.cursor.map(|Cursor(snapshot)| snapshot);
+    let mut left = job.spec.snapshots.indices().filter(|at| after.is_none_or(|after| *at > after));
+    let mut items = Vec::new();
+    for snapshot in left.by_ref().take(query.limit.get() as usize) {
+        items.push(body(&app, &job, snapshot, &request).await?);
+    }
+    let page = Page { items, more: left.next().is_some() };
+    PageBody::new(page, |item: &SnapshotBody| item.snapshot.to_string(), |item| item)
+        .answer(&request)
 }
 
 pub(super) async fn snapshot(
     Caller(app, access): Caller,
     Params((job, snapshot)): Params<(JobId, u32)>,
-) -> Result<Json<SnapshotBody>> {
+    request: RequestContext,
+) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
-    let files = app.store.result_files(&job, Some(snapshot)).await?;
-    let show = |file: ResultFile| FileBody { href: href(job.id, snapshot, &file.name), file };
+    request.json(&body(&app, &job, snapshot, &request).await?)
+}
+
+async fn body(
+    app: &App,
+    job: &Job,
+    snapshot: u32,
+    request: &RequestContext,
+) -> Result<SnapshotBody> {
+    let files = app.store.result_files(job, Some(snapshot)).await?;
+    let show = |file: ResultFile| {
+        let href = export(&file.name).map(|export| {
+            request.reference(&format!("/v1/jobs/{}/snapshots/{snapshot}/exports/{export}", job.id))
+        });
+        FileBody { href, file }
+    };
     let ready = !files.is_empty();
-    Ok(Json(SnapshotBody { snapshot, ready, files: files.into_iter().map(show).collect() }))
+    Ok(SnapshotBody { snapshot, ready, files: files.into_iter().map(show).collect() })
 }
 
-/// The address of a result file: the inverse of [`frame_file`] and of the routes.
-fn href(job: JobId, snapshot: u32, name: &str) -> Option<String> {
-    let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
-    if let "stack.exr" | "frames.npy" | "mosaic.npy" | "error.npy" | "manifest.json" = name {
-        return Some(format!("{base}/{name}"));
-    }
-    let (stem, kind) = name.rsplit_once('/')?.1.rsplit_once('.')?;
-    let number: u32 = stem.strip_prefix("frame_")?.parse().ok()?;
-    Some(format!("{base}/frames/{number}.{kind}"))
-}
-
-pub(super) async fn job_manifest(
-    Caller(app, access): Caller,
-    Params(job): Params<JobId>,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
-    let job = app.store.job(&access.lab, job).await?;
-    send(&app, &job, None, "manifest.json", (&method, &headers)).await
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/` and the name of a file: `manifest.json`, `frames.npy`,
-/// `mosaic.npy` or `error.npy`, as the routes have them.
-pub(super) async fn file(
-    Caller(app, access): Caller,
-    Params((job, snapshot)): Params<(JobId, u32)>,
-    uri: Uri,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
-    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
-    let name = uri.path().rsplit('/').next().unwrap_or_default();
-    if name == "mosaic.npy" && job.spec.shape.mosaic.is_none() {
-        let detail = "the sensor of this job is grey: frames.npy has its frames";
-        return Err(ApiError::new(Code::NotFound, detail));
-    }
-    send(&app, &job, Some(snapshot), name, (&method, &headers)).await
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}`, where the frame is `1.exr` or `1.png`.
-pub(super) async fn frame(
-    Caller(app, access): Caller,
-    Params((job, snapshot, frame)): Params<(JobId, u32, String)>,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
-    let job = with_snapshot(&app, &access.lab, job, snapshot).await?;
-    let frames = job.spec.shape.frames;
-    let name = frame_file(&frame, frames).ok_or_else(|| {
-        let detail = format!("frames are 1.exr to {frames}.exr, and the same with .png");
-        ApiError::new(Code::NotFound, detail)
-    })?;
-    send(&app, &job, Some(snapshot), &name, (&method, &headers)).await
+/// The export that a result file is.
+fn export(name: &str) -> Option<String> {
+    let format = match name {
+        "stack.exr" => "exr",
+        "frames.npy" => "npy",
+        "mosaic.npy" => "mosaic",
+        "error.npy" => "error",
+        "manifest.json" => "manifest",
+        _ => {
+            let (stem, kind) = name.rsplit_once('/')?.1.rsplit_once('.')?;
+            let number: u32 = stem.strip_prefix("frame_")?.parse().ok()?;
+            return Some(format!("frames/{number}.{kind}"));
+        }
+    };
+    Some(format.to_owned())
 }
 
 /// The result file that `1.exr` or `1.png` means, counted from 1 to `frames`.
-fn frame_file(frame: &str, frames: usize) -> Option<String> {
+pub(super) fn frame_file(frame: &str, frames: usize) -> Option<String> {
     let (number, kind) = frame.split_once('.')?;
     let folder = match kind {
         "exr" => "frames",
@@ -184,8 +192,7 @@ pub(super) fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String
 
 #[cfg(test)]
 mod tests {
-    use super::{frame_file, href};
-    use engine::job::JobId;
+    use super::{export, frame_file};
 
     #[test]
     fn frames_are_named_by_number_and_kind() {
@@ -197,22 +204,15 @@ mod tests {
     }
 
     #[test]
-    fn every_file_is_shown_with_its_address() {
-        let job = JobId::new();
-        let address = |name| href(job, 3, name).map(|text| text.split_off_after("snapshots/"));
-        assert_eq!(address("frames/frame_0012.exr").unwrap(), "3/frames/12.exr");
-        assert_eq!(address("png/frame_0012.png").unwrap(), "3/frames/12.png");
-        assert_eq!(address("stack.exr").unwrap(), "3/stack.exr");
-        assert_eq!(address("notes.txt"), None);
-    }
-
-    trait SplitOffAfter {
-        fn split_off_after(self, mark: &str) -> String;
-    }
-
-    impl SplitOffAfter for String {
-        fn split_off_after(self, mark: &str) -> String {
-            self.split_once(mark).unwrap().1.to_owned()
+    fn every_file_is_an_export() {
+        for (name, expected) in [
+            ("frames/frame_0012.exr", Some("frames/12.exr")),
+            ("png/frame_0012.png", Some("frames/12.png")),
+            ("stack.exr", Some("exr")),
+            ("error.npy", Some("error")),
+            ("notes.txt", None),
+        ] {
+            assert_eq!(export(name).as_deref(), expected, "{name}");
         }
     }
 }

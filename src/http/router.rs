@@ -1,24 +1,31 @@
 //! The routes: the table of contents of the API. `openapi.yaml` has the same ones; a test sees to it.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::error_handling::HandleErrorLayer;
 use axum::extract::DefaultBodyLimit;
 use axum::handler::Handler;
+use axum::http::{HeaderValue, Method};
 use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::routing::{MethodFilter, MethodRouter, on};
 use axum::{BoxError, Router};
 use tower::ServiceBuilder;
+use tower::util::MapRequestLayer;
 use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::cors::{AllowHeaders, CorsLayer};
 
 use super::access::{self, Rule};
 use super::app::App;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
-    algorithms, blobs, calibrations, dashboard, events, exports, jobs, labs, layers, me,
+    algorithms, blobs, calibrations, contract, dashboard, events, exports, jobs, labs, layers, me,
     measurements, models, pictures, problems, quality, reports, results, samples, session, system,
     tiles, tus,
 };
+
+/// Time for which a browser remembers what another origin may do.
+const PREFLIGHT_AGE: Duration = Duration::from_secs(3600);
 
 /// The largest JSON body.
 const JSON_BYTES: usize = 256 * 1024;
@@ -28,20 +35,16 @@ pub fn routes() -> Vec<Route> {
     use Route as R;
     vec![
         R::at("/v1/me").get(me::show),
-        R::at("/v1/session").post(session::create).delete(session::delete).only(Rule::Own),
         R::at("/v1/labs").get(labs::list).only(Rule::AllLabs),
         R::at("/v1/labs/{lab}").get(labs::show).patch(labs::change).only(Rule::AllLabs),
         R::at("/v1/blobs").get(blobs::list).post(blobs::create).uploads(),
         R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).delete(blobs::delete).uploads(),
         R::at("/v1/blobs/{sha256}/content").get(blobs::content).slow(),
-        R::at("/v1/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>).slow(),
         R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
         R::at("/v1/calibrations/{calibration}").get(calibrations::show).patch(calibrations::rename).delete(calibrations::delete),
-        R::at("/v1/calibrations/{calibration}/report.json").get(reports::json),
-        R::at("/v1/calibrations/{calibration}/report.html").get(reports::html),
-        R::at("/v1/calibrations/{calibration}/maps/{map}").get(reports::map),
+        R::at("/v1/calibrations/{calibration}/report").get(reports::json),
         R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
         R::at("/v1/measurements/{measurement}").get(measurements::show).patch(measurements::rename).delete(measurements::delete),
         R::at("/v1/models").get(models::list).post(models::create).slow(),
@@ -53,47 +56,41 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/jobs/{job}").get(jobs::show).patch(jobs::change).delete(jobs::delete),
         R::at("/v1/jobs/{job}/cancel").post(jobs::cancel),
         R::at("/v1/jobs/{job}/retry").post(jobs::retry),
-        R::at("/v1/jobs/{job}/manifest.json").get(results::job_manifest).slow(),
+        R::at("/v1/jobs/{job}/snapshots").get(results::list),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}").get(results::snapshot),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/manifest.json").get(results::file).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.exr").get(exports::exr).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy").get(results::file).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/mosaic.npy").get(results::file).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/error.npy").get(results::file).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames/{frame}").get(results::frame).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/stack.tif").get(exports::tiff).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/movie.mp4").get(exports::movie).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/zarr.json").get(exports::zarr),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0").get(exports::chunk).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/frames.zarr/c/{frame}/0/0/0").get(exports::chunk).slow(),
-        R::at("/v1/jobs/{job}/sequence/stack.tif").get(exports::tiff).slow(),
-        R::at("/v1/jobs/{job}/sequence/movie.mp4").get(exports::movie).slow(),
-        R::at("/v1/jobs/{job}/sequence/frames.npy").get(exports::array).slow(),
-        R::at("/v1/jobs/{job}/sequence/frames.zarr/zarr.json").get(exports::zarr),
-        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0").get(exports::chunk).slow(),
-        R::at("/v1/jobs/{job}/sequence/frames.zarr/c/{frame}/0/0/0").get(exports::chunk).slow(),
-        R::at("/v1/jobs/{job}/results.zip").get(exports::archive).slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).slow(),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).slow(),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>).slow(),
-        R::at("/v1/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).slow(),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).slow(),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>).slow(),
-        R::at("/v1/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/exports/{format}").get(exports::file).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/exports/{format}/{*path}").get(exports::part).slow(),
+        R::at("/v1/jobs/{job}/exports").post(exports::create),
+        R::at("/v1/jobs/{job}/exports/{format}").get(exports::file).slow(),
+        R::at("/v1/jobs/{job}/exports/{format}/{*path}").get(exports::part).slow(),
         R::at("/v1/events").get(events::listen).slow(),
         R::at("/v1/system").get(system::show).only(Rule::Admin),
-        R::at("/").get(dashboard::page).only(Rule::Public),
-        R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
         R::at("/livez").get(system::live).only(Rule::Public),
         R::at("/readyz").get(system::ready).only(Rule::Public),
         R::at("/metrics").get(system::metrics).only(Rule::Admin),
+
+        // Pages and what only they use: no part of the API that clients rely on.
+        R::at("/").get(dashboard::page).only(Rule::Public),
+        R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
         R::at("/problems/{code}").get(problems::show).only(Rule::Public),
-        R::at("/openapi.yaml").get(system::contract).only(Rule::Public),
+        R::at("/openapi.yaml").get(contract::yaml).only(Rule::Public),
+        R::at("/openapi.json").get(contract::json).only(Rule::Public),
+        R::at("/view/session").post(session::create).delete(session::delete).only(Rule::Own),
+        R::at("/view/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>).slow(),
+        R::at("/view/calibrations/{calibration}/report.html").get(reports::html),
+        R::at("/view/calibrations/{calibration}/maps/{map}").get(reports::map),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
     ]
 }
 
@@ -103,26 +100,52 @@ pub fn router(app: App) -> Router {
     let late = HandleErrorLayer::new(move |_: BoxError| async move { layers::timed_out(seconds) });
     let timeout = ServiceBuilder::new().layer(late).timeout(app.settings.request_time());
     let close = map_response(layers::close_after_refusal);
-    let hosts: Arc<[String]> = app.settings.hosts.clone().into();
+    let sites = Arc::new(access::Sites::new(&app.settings));
     let mut router = Router::new();
     for route in routes() {
         let (store, revocations) = (app.store.clone(), app.revocations.clone());
         let guard =
-            from_fn_with_state((store, hosts.clone(), revocations, route.rule), access::guard);
+            from_fn_with_state((store, sites.clone(), revocations, route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let handlers = handlers.route_layer(guard);
         let handlers = if route.uploads { handlers.layer(close.clone()) } else { handlers };
         router = router.route(route.path, handlers);
     }
-    router
+    let origins = cors(&app.settings.cors_origins);
+    let router = router
         .fallback(layers::not_found)
         .method_not_allowed_fallback(layers::method_not_allowed)
         .layer(DefaultBodyLimit::max(JSON_BYTES))
         .layer(CatchPanicLayer::custom(layers::panicked))
         .layer(from_fn(layers::one_host))
+        .layer(from_fn(layers::relative_references))
         .layer(from_fn(layers::observe))
-        .with_state(app)
+        .with_state(app);
+    // Around the routes: what changes the method or the path of a request.
+    let rewritten = ServiceBuilder::new().layer(MapRequestLayer::new(tus::rewrite)).service(router);
+    match origins {
+        Some(cors) => Router::new().fallback_service(layers::cors(cors, rewritten)),
+        None => Router::new().fallback_service(rewritten),
+    }
+}
+
+/// Lets pages of these origins use the API with a token; none without origins.
+fn cors(origins: &[HeaderValue]) -> Option<CorsLayer> {
+    let cors = CorsLayer::new()
+        .allow_origin(origins.to_vec())
+        .allow_methods([
+            Method::GET,
+            Method::HEAD,
+            Method::POST,
+            Method::PUT,
+            Method::PATCH,
+            Method::DELETE,
+        ])
+        .allow_headers(AllowHeaders::mirror_request())
+        .expose_headers(layers::exposed())
+        .max_age(PREFLIGHT_AGE);
+    (!origins.is_empty()).then_some(cors)
 }
 
 /// A path with its methods and handlers.
@@ -133,7 +156,7 @@ pub struct Route {
     /// The methods as they stand in the contract, in lower case.
     pub methods: Vec<&'static str>,
     handlers: MethodRouter<App>,
-    rule: Rule,
+    pub(super) rule: Rule,
     slow: bool,
     uploads: bool,
 }
@@ -234,7 +257,8 @@ mod tests {
                 // A route for GET also answers HEAD.
                 let with_get = key == "head" && item.get("get").is_some();
                 if key != "parameters" && key != "summary" && !with_get {
-                    documented.insert(format!("{key} {path}"));
+                    // OpenAPI has no sign for the rest of a path.
+                    documented.insert(format!("{key} {path}").replace("{path}", "{*path}"));
                 }
             }
         }

@@ -4,11 +4,11 @@ use std::fs::File;
 use std::io;
 use std::path::Path;
 
-use axum::Json;
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
+use super::context::changed;
 use super::error::{ApiError, Result};
 use super::extract::{Body, Caller, hashed_key, idempotency_key};
 use super::intake;
@@ -23,6 +23,7 @@ use store::{RequestKey, StagedBlob, Store};
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
 pub(super) struct SampleRequest {
     #[serde(default = "default_algorithm")]
     algorithm: Algorithm,
@@ -33,11 +34,14 @@ fn default_algorithm() -> Algorithm {
     Algorithm::PnpTvFastdvdnet
 }
 
-#[derive(Debug, Serialize)]
-struct SampleBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Sample")]
+pub(super) struct SampleBody {
+    /// The file of the masks.
     masks: Sha256,
+    /// The file of the measurement.
     data: Sha256,
-    /// The true frames, for the route `quality`.
+    /// The file of the true frames, for `quality`.
     truth: Sha256,
     job: JobBody,
 }
@@ -82,7 +86,8 @@ pub(super) async fn create(
     let key = hashed_key(key, &job)?;
     let (status, job) = jobs::make(&app, &access, job, key).await?;
     let location = [(header::LOCATION, job.place())];
-    Ok((status, location, Json(SampleBody { masks, data, truth, job })).into_response())
+    let body = SampleBody { masks, data, truth, job };
+    Ok((location, changed(status, &body)?).into_response())
 }
 
 fn name() -> Option<Label> {

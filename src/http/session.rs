@@ -1,27 +1,63 @@
-//! `/v1/session`: a browser shows its token once, and from then on a cookie that no script can read.
+//! `/view/session`: exchanges a token for a cookie that scripts cannot read.
 
 use std::time::Duration;
 
 use axum::Json;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::access::{SESSION, missing};
 use super::error::{ApiError, Code, Result};
-use super::extract::Caller;
+use super::extract::{Caller, QueryOf};
 use engine::job::{Secret, Timestamp, TokenId};
 
-/// How long a session lasts, if its token lasts as long.
+/// Longest life of a session.
 const LIFE: Duration = Duration::from_secs(7 * 86_400);
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Session")]
 pub(super) struct SessionBody {
     token: TokenId,
     expires_at: Timestamp,
 }
 
-pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
+/// The query of both requests. The browser sends the cookie below `path`, the path of the page, which may lie below a
+/// prefix of a proxy.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SessionQuery {
+    #[serde(default)]
+    path: CookiePath,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(try_from = "String")]
+struct CookiePath(String);
+
+impl Default for CookiePath {
+    fn default() -> Self {
+        Self("/".into())
+    }
+}
+
+impl TryFrom<String> for CookiePath {
+    type Error = &'static str;
+
+    fn try_from(path: String) -> Result<Self, &'static str> {
+        let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/-_.~%".contains(&byte);
+        if path.starts_with('/') && path.len() <= 200 && path.bytes().all(plain) {
+            return Ok(Self(path));
+        }
+        Err("path must be the path of the page, such as /sci/")
+    }
+}
+
+pub(super) async fn create(
+    Caller(app, access): Caller,
+    QueryOf(query): QueryOf<SessionQuery>,
+    headers: HeaderMap,
+) -> Result<Response> {
     let Some(token) = access.token else {
         let detail = "there are no tokens, so that nobody needs a session";
         return Err(ApiError::new(Code::IllegalState, detail));
@@ -36,24 +72,28 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
     let expires_at = access.expires_at.map_or(end, |expires| expires.min(end));
     app.store.add_session(token, &secret, expires_at).await?;
     let seconds = (expires_at.0 - now.0).max(0) / 1000;
-    let cookie = cookie(&headers, secret.reveal(), seconds);
+    let cookie = cookie(&headers, &query.path, secret.reveal(), seconds);
     let body = Json(SessionBody { token, expires_at });
     Ok((StatusCode::CREATED, [(header::SET_COOKIE, cookie)], body).into_response())
 }
 
 /// Ends the session, if one was shown.
-pub(super) async fn delete(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
+pub(super) async fn delete(
+    Caller(app, access): Caller,
+    QueryOf(query): QueryOf<SessionQuery>,
+    headers: HeaderMap,
+) -> Result<Response> {
     if let Some(secret) = &access.session {
         app.store.end_session(secret).await?;
     }
-    let cookie = cookie(&headers, "", 0);
+    let cookie = cookie(&headers, &query.path, "", 0);
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
 }
 
-fn cookie(headers: &HeaderMap, value: &str, seconds: i64) -> String {
+fn cookie(headers: &HeaderMap, CookiePath(path): &CookiePath, value: &str, seconds: i64) -> String {
     // TLS ends at a proxy; the browser says what it sees.
     let origin = headers.get(header::ORIGIN).and_then(|origin| origin.to_str().ok());
     let secure = origin.is_some_and(|origin| origin.starts_with("https://"));
     let secure = if secure { "; Secure" } else { "" };
-    format!("{SESSION}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}")
+    format!("{SESSION}={value}; Path={path}; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}")
 }

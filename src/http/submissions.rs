@@ -4,34 +4,32 @@
 use std::str::FromStr;
 use std::time::Duration;
 
-use axum::http::HeaderMap;
 use serde::Serialize;
-use serde_json::Value;
 
 use super::access::Access;
 use super::app::App;
-use super::error::{ApiError, Code, REQUEST_ID, Result};
+use super::error::{ApiError, Code, Problem, REQUEST_ID, Result};
 use engine::job::{CheckLimits, InvalidId, Lab, Submission, ThingId};
 use store::{Inserted, Made, NewRequest, Request, RequestKey, StoreError};
 
 /// How long a request waits for a check by default.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// The longest that a request may wait, in seconds.
-const MOST_PATIENCE: f64 = 20.0;
+pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 
-/// How far something is that is made of files.
+/// State of a calibration or measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "ResourceState")]
 pub(super) enum Stage {
-    /// Its files are checked, or masks are made of captures.
+    /// Files are being checked, or masks computed from captures.
     Preparing,
     Ready,
-    /// There will be nothing; `error` says why.
+    /// The check failed; `problem` says why.
     Failed,
 }
 
 /// State of a pending request; if it failed, the reason in words and as a problem.
-pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Value>) {
+pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Problem>) {
     let Some(refusal) = request.refusal.clone() else { return (Stage::Preparing, None, None) };
     let detail = refusal.detail.clone();
     let problem = || ApiError::from(refusal).problem();
@@ -41,27 +39,6 @@ pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Value
         None => problem(),
     };
     (Stage::Failed, Some(detail), Some(problem))
-}
-
-/// How long the client wants to wait for a check (RFC 7240): `Prefer: respond-async` or `wait=SECONDS`.
-pub(super) fn patience(headers: &HeaderMap) -> Duration {
-    let values = headers.get_all("prefer").iter().filter_map(|value| value.to_str().ok());
-    let mut wait = None;
-    let mut is_async = false;
-    for preference in values.flat_map(|value| value.split([',', ';'])) {
-        let (name, value) = preference.split_once('=').unwrap_or((preference, ""));
-        match name.trim().to_ascii_lowercase().as_str() {
-            "respond-async" => is_async = true,
-            // The RFC has malformed preferences ignored.
-            "wait" => wait = value.trim().trim_matches('"').parse::<f64>().ok(),
-            _ => {}
-        }
-    }
-    match wait.filter(|seconds| *seconds >= 0.0) {
-        Some(seconds) => Duration::from_secs_f64(seconds.min(MOST_PATIENCE)),
-        None if is_async => Duration::ZERO,
-        None => PATIENCE,
-    }
 }
 
 /// Has something made, or finds what was made with the same key. Waits so long for the check of its uploads.
@@ -158,31 +135,4 @@ async fn vet(app: &App, lab: &Lab, submission: &Submission) -> Result<()> {
         found.map_err(|error| ApiError::reference(&place, error))?;
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use axum::http::{HeaderMap, HeaderValue};
-
-    use super::{PATIENCE, patience};
-
-    #[test]
-    fn clients_say_how_long_they_wait() {
-        let wait = |values: &[&'static str]| {
-            let mut headers = HeaderMap::new();
-            for value in values {
-                headers.append("prefer", HeaderValue::from_static(value));
-            }
-            patience(&headers)
-        };
-        assert_eq!(wait(&[]), PATIENCE);
-        assert_eq!(wait(&["respond-async"]), Duration::ZERO);
-        assert_eq!(wait(&["respond-async, wait=3"]), Duration::from_secs(3));
-        assert_eq!(wait(&["Respond-Async", "wait=\"2.5\"; x=1"]), Duration::from_secs_f64(2.5));
-        assert_eq!(wait(&["wait=100"]), Duration::from_secs(20));
-        assert_eq!(wait(&["wait=-1, handling=lenient"]), PATIENCE);
-        assert_eq!(wait(&["wait=NaN"]), PATIENCE);
-    }
 }

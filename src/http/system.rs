@@ -1,5 +1,5 @@
 //! What the service is and how it is: `/v1/system` for people, `/livez` and `/readyz` for what watches
-//! it, `/metrics` for Prometheus; and the contract, `/openapi.yaml`.
+//! it, `/metrics` for Prometheus.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -23,47 +23,57 @@ use strum::VariantArray;
 /// Time between two tries whether files can be written.
 const DISK_LOOK: Duration = Duration::from_secs(2);
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "System")]
 pub(super) struct SystemBody {
     version: &'static str,
     started_at: Timestamp,
     now: Timestamp,
-    /// Where the network runs, as the service was told.
+    /// Device that runs networks.
     device: String,
     /// Name of the execution provider for that device.
     provider: &'static str,
-    /// As the last worker told that used it.
+    /// Version of ONNX Runtime, as reported by the last worker that used it.
     onnxruntime: Option<String>,
+    /// Workers that the service keeps running.
     workers_wanted: usize,
+    /// Workers that are alive.
     workers: Vec<WorkerRow>,
     /// What keeps the service from doing some jobs; empty if it does all.
     degraded: Vec<String>,
+    /// Jobs by state.
     jobs: BTreeMap<&'static str, u64>,
-    /// Tasks that can be taken up, wait for others, and are in work.
+    /// Tasks by state.
     queue: QueueBody,
     disk: DiskBody,
     limits: LimitsBody,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "QueueCounts")]
 struct QueueBody {
     ready: u64,
     blocked: u64,
     running: u64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Disk")]
 struct DiskBody {
     free_bytes: u64,
     size_bytes: u64,
+    /// Bytes that uploads leave free.
     reserved_bytes: u64,
+    /// Uploads, prepared arrays and tiles.
     files: u64,
     file_bytes: u64,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "SystemLimits")]
 struct LimitsBody {
     upload_bytes: u64,
+    /// Uploads at the same time.
     uploads: usize,
     worker_memory_bytes: u64,
 }
@@ -116,29 +126,35 @@ async fn disk(app: &App) -> Result<DiskBody> {
     Ok(DiskBody { free_bytes, size_bytes, reserved_bytes, files, file_bytes })
 }
 
-/// Each part of the service: `ok`, or what is wrong.
-#[derive(Debug, Serialize)]
-struct Readiness {
+/// Readiness of the service. Each part is `ok` or states its fault.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+pub(super) struct Readiness {
     ready: bool,
-    /// True if some jobs can't be done, and others can.
+    /// True if some jobs cannot be done while others can.
     degraded: bool,
     database: String,
     disk: String,
     workers: String,
     /// The problem if no worker takes tiles.
     tiles: String,
-    /// Only with `serve --nats`.
+    /// Connection to other machines; only with `serve --nats`.
     #[serde(skip_serializing_if = "Option::is_none")]
     cluster: Option<String>,
-    /// What jobs with networks need.
+    /// The library that jobs with networks need.
     networks: String,
-    /// Whether files are kept from networks of users.
+    /// Confinement of networks of users, which keeps files from them.
     confinement: String,
 }
 
+/// The process answers.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+pub(super) struct Liveness {
+    live: bool,
+}
+
 /// `GET /livez`: the process answers.
-pub(super) async fn live() -> Json<serde_json::Value> {
-    Json(serde_json::json!({"live": true}))
+pub(super) async fn live() -> Json<Liveness> {
+    Json(Liveness { live: true })
 }
 
 /// `GET /readyz`: database, disk and workers are there. A long queue is no fault. Nor is a message server
@@ -244,9 +260,4 @@ pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
     labs.retain(|figures| access.all_labs || figures.lab == access.lab);
     figures.add_labs(&labs);
     Ok((kind, app.metrics.render() + &figures.into_text()).into_response())
-}
-
-pub(super) async fn contract() -> Response {
-    let kind = [(header::CONTENT_TYPE, "application/yaml")];
-    (kind, include_str!("../../openapi.yaml")).into_response()
 }

@@ -1,4 +1,4 @@
-//! Tiles of a job as they are worked on, and how the solver converges on each.
+//! Tiles of a job with their state, and the convergence of the solver on each.
 
 use axum::http::HeaderMap;
 use axum::response::Response;
@@ -11,22 +11,25 @@ use super::jobs::with_snapshot;
 use engine::job::{JobId, SnapshotRange};
 use store::{TileHistory, TileState};
 
-#[derive(Debug, Serialize)]
-struct TilesBody {
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "TileList")]
+pub(super) struct TilesBody {
     snapshot: u32,
     items: Vec<TileBody>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "TileState")]
 struct TileBody {
-    /// The place in the picture that it has a part in.
+    /// First row of the tile in the picture.
     row: usize,
+    /// First column of the tile in the picture.
     column: usize,
     height: usize,
     width: usize,
-    /// Which sub-image of a mosaic it belongs to.
+    /// Sub-image of a mosaic, from 0 to 3, row by row of a cell; null for a grey sensor.
     plane: Option<usize>,
-    /// The run of snapshots that it belongs to.
+    /// The run of snapshots that the tile belongs to.
     snapshots: SnapshotRange,
     #[serde(flatten)]
     state: TileState,

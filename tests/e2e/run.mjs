@@ -50,7 +50,7 @@ async function everything() {
   const adaptive = await service.submit({ measurement, algorithm: "gap-tv3d", label: "with a pilot" });
   await service.when(adaptive.id, (job) => job.state === "succeeded");
   await page.goto(`${service.url}/#/jobs/${adaptive.id}`);
-  const { content } = await service.call("GET", `/v1/jobs/${adaptive.id}/manifest.json`);
+  const { content } = await service.call("GET", `/v1/jobs/${adaptive.id}/exports/manifest`);
   await checks.step("decided", () => decided(page, checks, content.pilot.stages[0]));
   await checks.look(page, "job-pilot");
   await checks.step("captures", () => captures(page, checks, small));

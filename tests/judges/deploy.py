@@ -318,8 +318,9 @@ def filtered(root, wrong, program):
     return None
 
 
-def ask(url, body=None):
-    request = urllib.request.Request(url, body and json.dumps(body).encode(), {"Content-Type": "application/json"})
+def ask(url, body=None, wait=0):
+    headers = {"Content-Type": "application/json", "Prefer": f"wait={wait}"}
+    request = urllib.request.Request(url, body and json.dumps(body).encode(), headers)
     with urllib.request.urlopen(request, timeout=60) as answer:
         return json.load(answer)
 
@@ -328,7 +329,7 @@ def sample_job(url):
     """Final state of a short job."""
     job = ask(f"{url}/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
     for _ in range(6):
-        state = ask(f"{url}/v1/jobs/{job}?wait=20")["state"]
+        state = ask(f"{url}/v1/jobs/{job}", wait=20)["state"]
         if state not in ("queued", "running"):
             break
     return state

@@ -44,9 +44,9 @@ ready=$(curl -sS --fail-with-body "$api/readyz" | jq -c '{ready, degraded}')
 
 start=$(date +%s%N)
 job=$(ask "$api/v1/samples" --json '{}' | jq -r .job.id)
-while state=$(ask "$api/v1/jobs/$job?wait=20" | jq -r .state); [ "$state" = queued ] || [ "$state" = running ]; do :; done
+while state=$(ask "$api/v1/jobs/$job" -H "Prefer: wait=20" | jq -r .state); [ "$state" = queued ] || [ "$state" = running ]; do :; done
 took=$(( ($(date +%s%N) - start) / 1000000 ))
-ask "$api/v1/jobs/$job/snapshots/0/frames.npy" > "$root/lab/frames.npy"
+ask "$api/v1/jobs/$job/snapshots/0/exports/npy" > "$root/lab/frames.npy"
 [ "$state" = succeeded ] || { ask "$api/v1/jobs/$job" >&2; exit 1; }
 
 # A lab machine: submit, watch and download a simulated measurement with the commands of the same archive.

@@ -178,8 +178,9 @@ class Container:
         return done.returncode, done.stdout.strip()
 
 
-def ask(token, path, body=None):
-    request = urllib.request.Request(f"http://127.0.0.1:8080{path}", headers={"Authorization": f"Bearer {token}"})
+def ask(token, path, body=None, wait=0):
+    headers = {"Authorization": f"Bearer {token}", "Prefer": f"wait={wait}"}
+    request = urllib.request.Request(f"http://127.0.0.1:8080{path}", headers=headers)
     if body is not None:
         request.data = json.dumps(body).encode()
         request.add_header("Content-Type", "application/json")
@@ -203,12 +204,12 @@ def job(server, running):
     """Runs a job on the worker, because the server leaves all tiles to other machines."""
     status, token = server.run(["token", "--data", "/data", "create", "--lab", "optics", "--role", "admin"])
     require(status == 0 and token, "no token could be created")
-    created = ask(token, "/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
+    created = ask(token, "/v1/samples", {"algorithm": "gap-tv"}, wait=10)["job"]["id"]
     start = time.monotonic()
     while time.monotonic() - start < PATIENCE:
         for name, process in running.items():
             require(process.poll() is None, f"{name} ends with {process.returncode}")
-        state = ask(token, f"/v1/jobs/{created}?wait=5")["state"]
+        state = ask(token, f"/v1/jobs/{created}", wait=5)["state"]
         if state not in ("queued", "running"):
             require(state == "succeeded", f"the job is {state}")
             pools = [worker["pool"] for worker in ask(token, "/v1/system")["workers"] if worker.get("pool")]

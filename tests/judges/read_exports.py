@@ -25,13 +25,13 @@ def main():
         with urllib.request.urlopen(urllib.request.Request(base + path, headers=headers | more)) as answer:
             return answer.read()
 
-    snapshots = [np.load(io.BytesIO(get(f"/snapshots/{index}/frames.npy"))) for index in range(count)]
+    snapshots = [np.load(io.BytesIO(get(f"/snapshots/{index}/exports/npy"))) for index in range(count)]
     clips = {f"/snapshots/{index}": frames for index, frames in enumerate(snapshots)}
-    clips["/sequence"] = np.concatenate(snapshots)
-    assert (np.load(io.BytesIO(get("/sequence/frames.npy"))) == clips["/sequence"]).all()
+    clips[""] = np.concatenate(snapshots)
+    assert (np.load(io.BytesIO(get("/exports/npy"))) == clips[""]).all()
     intervals = {}
     for place, frames in clips.items():
-        with tifffile.TiffFile(io.BytesIO(get(f"{place}/stack.tif"))) as file:
+        with tifffile.TiffFile(io.BytesIO(get(f"{place}/exports/tiff"))) as file:
             colours = frames.ndim == 4
             assert file.is_bigtiff and file.is_ome and file.byteorder == "<"
             assert len(file.pages) == len(frames)
@@ -50,11 +50,11 @@ def main():
             planes = [float(plane.get("DeltaT")) for plane in pixels.findall("{*}Plane")]
             assert len(planes) in (0, len(frames)) and planes == sorted(planes)
         array = zarr.open_array(
-            f"{base}{place}/frames.zarr", mode="r", storage_options={"client_kwargs": {"headers": headers}}
+            f"{base}{place}/exports/zarr", mode="r", storage_options={"client_kwargs": {"headers": headers}}
         )
         assert array.shape == frames.shape and array.dtype == np.float32 and array.chunks == (1, *frames.shape[1:])
         assert (array[:] == frames).all() and (array[-1, 3:5] == frames[-1, 3:5]).all()
-    archive = get("/results.zip")
+    archive = get("/exports/zip")
     with zipfile.ZipFile(io.BytesIO(archive)) as file:
         assert file.testzip() is None
         assert all(info.compress_type == zipfile.ZIP_STORED for info in file.infolist())
@@ -64,7 +64,7 @@ def main():
             assert (np.load(io.BytesIO(file.read(f"snapshot_{index:04d}/frames.npy"))) == frames).all()
     # An interrupted download can be continued.
     cut = len(archive) // 3
-    assert archive[:cut] + get("/results.zip", Range=f"bytes={cut}-") == archive
+    assert archive[:cut] + get("/exports/zip", Range=f"bytes={cut}-") == archive
     print(json.dumps({"intervals": intervals, "members": len(names)}))
 
 

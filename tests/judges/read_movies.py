@@ -19,13 +19,18 @@ def main():
     url, job, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
     headers = {"Authorization": f"Bearer {os.environ['SCI_RECON_TOKEN']}"}
 
-    def get(path):
-        with urllib.request.urlopen(urllib.request.Request(f"{url}/v1/jobs/{job}{path}", headers=headers)) as answer:
+    def get(path, body=None):
+        address = f"{url}/v1/jobs/{job}{path}"
+        content = {"Content-Type": "application/json"} if body else {}
+        request = urllib.request.Request(address, data=body and json.dumps(body).encode(), headers=headers | content)
+        with urllib.request.urlopen(request) as answer:
             return answer.status, answer.headers, answer.read()
 
-    def made(path):
+    def made(place, snapshot):
+        status, fields, _ = get("/exports", {"format": "mp4", "snapshot": snapshot})
+        assert status in (200, 202) and fields["Location"] == f"{place}/exports/mp4".lstrip("/"), fields
         while True:
-            status, fields, content = get(path)
+            status, fields, content = get(f"{place}/exports/mp4")
             if status == 200:
                 assert fields["Content-Type"] == "video/mp4" and int(fields["Content-Length"]) == len(content)
                 return content
@@ -38,13 +43,14 @@ def main():
         files = json.loads(get(f"/snapshots/{snapshot}")[2])["files"]
         frames = sum(file["name"].startswith("png/") for file in files)
         for frame in range(1, frames + 1):
-            yield levels(Image.open(io.BytesIO(get(f"/snapshots/{snapshot}/frames/{frame}.png")[2])))
+            yield levels(Image.open(io.BytesIO(get(f"/snapshots/{snapshot}/exports/frames/{frame}.png")[2])))
 
-    clips = {f"/snapshots/{index}": np.stack(list(pictures(index))) for index in range(count)}
-    clips["/sequence"] = np.concatenate(list(clips.values()))
+    clips = {index: np.stack(list(pictures(index))) for index in range(count)}
+    clips[None] = np.concatenate(list(clips.values()))
     told = {"psnr_db": [], "bytes": {}}
-    for place, expected in clips.items():
-        content = made(f"{place}/movie.mp4")
+    for snapshot, expected in clips.items():
+        place = "" if snapshot is None else f"/snapshots/{snapshot}"
+        content = made(place, snapshot)
         with av.open(io.BytesIO(content)) as movie:
             stream = movie.streams.video[0]
             assert stream.codec_context.name == "libdav1d" and stream.average_rate == 10

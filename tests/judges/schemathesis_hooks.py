@@ -11,7 +11,7 @@ ENOUGH = 10**12
 
 @schemathesis.hook
 def before_call(context, case, kwargs):
-    """Raises small limits of labs, because all later requests would correctly be answered with 507."""
+    """Raises small limits of labs, because all later requests would correctly be answered with 403."""
     if case.operation.label == "PATCH /v1/labs/{lab}" and isinstance(case.body, dict):
         for limit in ("bytes", "jobs"):
             if type(case.body.get(limit)) is int and 0 <= case.body[limit] < ENOUGH:

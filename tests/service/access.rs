@@ -8,8 +8,15 @@ use serde_json::{Value, json};
 use crate::app::{TestApp, id};
 use crate::samples::Scene;
 
-const PUBLIC: [&str; 6] =
-    ["/livez", "/readyz", "/openapi.yaml", "/", "/dashboard/{file}", "/problems/{code}"];
+const PUBLIC: [&str; 7] = [
+    "/livez",
+    "/readyz",
+    "/openapi.yaml",
+    "/openapi.json",
+    "/",
+    "/dashboard/{file}",
+    "/problems/{code}",
+];
 
 /// The path of a route with values for its parameters.
 fn with_parameters(path: &str) -> String {
@@ -116,12 +123,12 @@ async fn data_of_another_lab_look_nonexistent() {
     for (method, end) in [
         (Method::POST, "/cancel"),
         (Method::POST, "/retry"),
-        (Method::GET, "/manifest.json"),
+        (Method::GET, "/exports/manifest"),
         (Method::GET, "/snapshots/0"),
-        (Method::GET, "/snapshots/0/manifest.json"),
-        (Method::GET, "/snapshots/0/stack.exr"),
-        (Method::GET, "/snapshots/0/frames.npy"),
-        (Method::GET, "/snapshots/0/frames/1.exr"),
+        (Method::GET, "/snapshots/0/exports/manifest"),
+        (Method::GET, "/snapshots/0/exports/exr"),
+        (Method::GET, "/snapshots/0/exports/npy"),
+        (Method::GET, "/snapshots/0/exports/frames/1.exr"),
     ] {
         let ask = |id: &str| app.request(method.clone(), &format!("/v1/jobs/{id}{end}"));
         let theirs = app.send(ask(&job)).await;
@@ -158,13 +165,13 @@ async fn a_token_stores_no_more_than_its_quota() {
     app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "1000"]));
     app.upload(vec![1; 600]).await;
     let send = |bytes: Vec<u8>| app.send(app.request(Method::POST, "/v1/blobs").body(bytes));
-    let detail = send(vec![2; 600]).await.problem(507, "quota_exceeded");
+    let detail = send(vec![2; 600]).await.problem(403, "quota_exceeded");
     assert!(detail.contains("600") && detail.contains("1000"), "{detail}");
     // The quota also applies to an upload without a length.
     let chunks = futures_util::stream::iter([Ok::<_, std::io::Error>(vec![3u8; 600])]);
     let body = reqwest::Body::wrap_stream(chunks);
     let answer = app.send(app.request(Method::POST, "/v1/blobs").body(body)).await;
-    answer.problem(507, "quota_exceeded");
+    answer.problem(403, "quota_exceeded");
     send(vec![4; 400]).await.expect(201);
 }
 

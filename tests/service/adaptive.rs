@@ -54,11 +54,11 @@ async fn run(
     let job = app.submit(&body).await;
     let ended = app.ended(&job).await;
     assert_eq!(ended["state"], "succeeded", "{ended:#}");
-    let manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    let manifest = app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
     let content = manifest["content"].clone();
     let stages = content["schedule"]["stages"].as_array().unwrap();
     let decided: u64 = stages.iter().filter_map(|stage| stage["iterations"].as_u64()).sum();
-    let last = app.get(&format!("/v1/jobs/{job}/snapshots/0/tiles/0/history")).await.expect(200);
+    let last = app.get(&format!("/view/jobs/{job}/snapshots/0/tiles/0/history")).await.expect(200);
     let last = last.json()["points"].as_array().unwrap().last().unwrap()[0].clone();
     assert_eq!(last, decided, "the tiles run the iterations of the schedule");
     let mut files = results(app, &job).await;

@@ -165,7 +165,7 @@ async fn a_token_expires_and_records_its_last_use() {
     app.sign_in(&token);
     let me = app.get("/v1/me").await.expect(200).json();
     assert_eq!(me["expires_at"].as_str().unwrap()[..19], soon[..19]);
-    let session = app.send(app.request(Method::POST, "/v1/session")).await.expect(201);
+    let session = app.send(app.request(Method::POST, "/view/session")).await.expect(201);
     assert_eq!(session.json()["expires_at"], me["expires_at"], "the session ends with its token");
     let session = session.header("set-cookie").split(';').next().unwrap().to_owned();
     let mut events = app.request(Method::GET, "/v1/events").send().await.unwrap();
@@ -201,7 +201,7 @@ fn time_after(seconds: i64) -> String {
 async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
     let (app, [a, ..], job) = three_tokens().await;
     app.sign_in(&a);
-    let begin = || app.request(Method::POST, "/v1/session");
+    let begin = || app.request(Method::POST, "/view/session");
     let session = app.send(begin().header("origin", "https://bench.example")).await.expect(201);
     let cookie = session.header("set-cookie").to_owned();
     for part in ["; HttpOnly", "; SameSite=Strict", "; Secure", "; Path=/", "; Max-Age=60480"] {
@@ -228,11 +228,11 @@ async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
         let refused = app.send(ask(Method::POST, &cancel, lines)).await;
         refused.problem(403, "foreign_site");
     }
-    app.send(ask(Method::POST, "/v1/session", &[header])).await.problem(401, "unauthorized");
+    app.send(ask(Method::POST, "/view/session", &[header])).await.problem(401, "unauthorized");
     let same = [header, ("sec-fetch-site", "same-origin")];
     app.send(ask(Method::POST, &cancel, &same)).await.expect(202);
-    let other = app.send(app.request(Method::POST, "/v1/session").bearer_auth(&a)).await;
-    let ended = app.send(ask(Method::DELETE, "/v1/session", &same)).await.expect(204);
+    let other = app.send(app.request(Method::POST, "/view/session").bearer_auth(&a)).await;
+    let ended = app.send(ask(Method::DELETE, "/view/session", &same)).await.expect(204);
     assert!(ended.header("set-cookie").contains("sci_recon_session=; "));
     app.send(ask(Method::GET, "/v1/jobs", &[])).await.problem(401, "unauthorized");
     // Revoking a token ends its sessions.
@@ -248,10 +248,10 @@ async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
 #[tokio::test]
 async fn a_service_without_tokens_needs_no_session() {
     let app = TestApp::start().await;
-    let session = app.send(app.request(Method::POST, "/v1/session")).await;
+    let session = app.send(app.request(Method::POST, "/view/session")).await;
     session.problem(409, "illegal_state");
     assert_eq!(app.get("/v1/me").await.json()["all_labs"], true);
-    app.send(app.request(Method::DELETE, "/v1/session")).await.expect(204);
+    app.send(app.request(Method::DELETE, "/view/session")).await.expect(204);
 }
 
 #[tokio::test]

@@ -6,6 +6,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc;
 use std::time::Duration;
 
+use reqwest::header::{CONTENT_LOCATION, LOCATION};
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -33,7 +34,14 @@ pub struct Answer {
 
 impl Answer {
     pub async fn read(response: Response) -> Self {
-        let (status, headers) = (response.status(), response.headers().clone());
+        let (status, mut headers) = (response.status(), response.headers().clone());
+        // References are relative, and resolved as clients do.
+        for name in [LOCATION, CONTENT_LOCATION] {
+            let Some(place) = headers.get(&name) else { continue };
+            assert!(!place.as_bytes().starts_with(b"/"), "{place:?} ignores the prefix of a proxy");
+            let place = response.url().join(place.to_str().unwrap()).unwrap();
+            headers.insert(name, place.path().parse().unwrap());
+        }
         Self { status, headers, bytes: response.bytes().await.unwrap().to_vec() }
     }
 
@@ -56,7 +64,9 @@ impl Answer {
         let problem = self.json();
         assert_eq!(problem["code"], code, "{text}");
         assert_eq!(problem["status"], status);
-        assert_eq!(problem["type"], format!("/problems/{code}"));
+        assert_eq!(problem["type"], format!("urn:sci-recon:problem:{code}"));
+        let page = format!("{code}>; rel=\"help\"");
+        assert!(self.header("link").ends_with(&page), "{:?}", self.headers);
         let request = self.header("x-request-id");
         assert_eq!(problem["instance"], format!("urn:sci-recon:request:{request}"));
         assert!(problem["title"].is_string() && problem["retryable"].is_boolean());
@@ -224,6 +234,12 @@ impl TestApp {
 
     pub async fn get(&self, path: &str) -> Answer {
         self.send(self.request(Method::GET, path)).await
+    }
+
+    /// Sends a GET that waits at most `seconds` for the end of the work.
+    pub async fn wait(&self, path: &str, seconds: &str) -> Answer {
+        let request = self.request(Method::GET, path).header("prefer", format!("wait={seconds}"));
+        self.send(request).await
     }
 
     /// Repeats a GET until the answer has this status, for at most a minute.

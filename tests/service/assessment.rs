@@ -29,18 +29,19 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
         ["good", "usable", "bad"].contains(&expected_quality["grade"].as_str().unwrap()),
         "{expected_quality}"
     );
-    let job_manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    let job_manifest =
+        app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
     let snapshots = job_manifest["content"]["snapshots"].as_array().unwrap();
     let mean =
         snapshots.iter().map(|one| one["assessment"]["psnr_db"].as_f64().unwrap()).sum::<f64>();
     assert!((mean / snapshots.len() as f64 - figure("psnr_db")).abs() < 0.06, "{job_manifest}");
 
     let base = format!("/v1/jobs/{job}/snapshots/0");
-    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
+    let manifest = app.get(&format!("{base}/exports/manifest")).await.expect(200).json();
     assert_eq!(manifest["content"]["assessment"], snapshots[0]["assessment"]);
     let Scene { frames, height, width, .. } = Scene::SMALL;
     let blocks = (height.div_ceil(16), width.div_ceil(16));
-    let array = app.get(&format!("{base}/error.npy")).await.expect(200).bytes;
+    let array = app.get(&format!("{base}/exports/error")).await.expect(200).bytes;
     let header = String::from_utf8_lossy(&array[..128]).into_owned();
     let shape = format!("({frames}, {}, {})", blocks.0, blocks.1);
     assert!(header.contains(&shape), "{header}: {shape}");
@@ -50,7 +51,11 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
     assert!(values.iter().all(|error| *error > 0.0 && *error < 1.0), "{values:?}");
 
     // Each pixel of the image shows its block.
-    let spread = app.get(&format!("{base}/pictures/error-2/spread")).await.expect(200).json();
+    let spread = app
+        .get(&format!("{base}/pictures/error-2/spread").replace("/v1/", "/view/"))
+        .await
+        .expect(200)
+        .json();
     assert_eq!(
         (spread["height"].as_u64(), spread["width"].as_u64()),
         (Some(height as u64), Some(width as u64))
@@ -63,7 +68,9 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
         let actual = f32::from(shown[row * columns + column]);
         assert!((actual - expected).abs() <= 0.51, "{row}, {column}: {actual} for {expected}");
     }
-    app.get(&format!("{base}/pictures/error-{}", frames + 1)).await.problem(404, "not_found");
+    app.get(&format!("{base}/pictures/error-{}", frames + 1).replace("/v1/", "/view/"))
+        .await
+        .problem(404, "not_found");
 }
 
 #[tokio::test]
@@ -73,10 +80,15 @@ async fn an_error_is_not_predicted_without_a_model_for_it() {
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "admm-tv"})).await;
     assert_eq!(app.ended(&job).await["assessment"], Value::Null);
     let base = format!("/v1/jobs/{job}/snapshots/0");
-    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
+    let manifest = app.get(&format!("{base}/exports/manifest")).await.expect(200).json();
     assert_eq!(manifest["content"]["assessment"], Value::Null);
-    for path in ["error.npy", "pictures/error-1", "stack.exr?layers=sigma"] {
-        let why = app.get(&format!("{base}/{path}")).await.problem(404, "not_found");
+    let view = base.replace("/v1/", "/view/");
+    for path in [
+        format!("{base}/exports/error"),
+        format!("{view}/pictures/error-1"),
+        format!("{base}/exports/exr?layers=sigma"),
+    ] {
+        let why = app.get(&path).await.problem(404, "not_found");
         assert!(why.contains("no error can be predicted"), "{why}");
     }
 }
@@ -89,7 +101,7 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
     let folder = app.data().join("results").join(&job).join("snapshot_0001");
-    let plain = format!("/v1/jobs/{job}/snapshots/1/stack.exr");
+    let plain = format!("/v1/jobs/{job}/snapshots/1/exports/exr");
     let path = format!("{plain}?layers=sigma");
     let complete = app.get(&path).await.expect(200);
     let (size, etag) = (complete.bytes.len(), complete.header("etag").to_owned());

@@ -126,7 +126,7 @@ impl TestApp {
         let id = calibration["id"].as_str().unwrap();
         let start = Instant::now();
         loop {
-            let answer = self.get(&format!("/v1/calibrations/{id}/report.json")).await;
+            let answer = self.get(&format!("/v1/calibrations/{id}/report")).await;
             if answer.status == 200 {
                 return answer.json();
             }
@@ -250,16 +250,17 @@ async fn the_report_has_maps_and_a_page() {
     let calibration = app.calibrate_captures(&captures).await;
     let report = app.report(&calibration).await;
     let base = format!("/v1/calibrations/{}", calibration["id"].as_str().unwrap());
+    let view = base.replace("/v1/", "/view/");
     assert_eq!(report["maps"], json!(["mean", "deviation", "gram", "illumination"]));
     for map in report["maps"].as_array().unwrap() {
         let answer =
-            app.get(&format!("{base}/maps/{}.png", map.as_str().unwrap())).await.expect(200);
+            app.get(&format!("{view}/maps/{}.png", map.as_str().unwrap())).await.expect(200);
         assert_eq!(answer.header("content-type"), "image/png");
         let picture = image::load_from_memory(&answer.bytes).unwrap();
         assert_eq!((picture.width(), picture.height()), (SIDE as u32, SIDE as u32));
     }
-    app.get(&format!("{base}/maps/nothing.png")).await.problem(404, "not_found");
-    let page = app.get(&format!("{base}/report.html")).await.expect(200);
+    app.get(&format!("{view}/maps/nothing.png")).await.problem(404, "not_found");
+    let page = app.get(&format!("{view}/report.html")).await.expect(200);
     assert!(page.header("content-security-policy").contains("default-src 'none'"));
     let text = String::from_utf8(page.bytes).unwrap();
     assert!(text.contains("maps/gram.png") && !text.contains("<script"), "{text}");
@@ -357,7 +358,7 @@ async fn a_calibration_without_a_worker_is_not_ready() {
     let refused = app.post("/v1/measurements", &body).await;
     refused.problem(409, "calibration_not_ready");
     assert_eq!(refused.json()["retryable"], true, "the calibration is still queued");
-    let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await;
+    let report = app.get(&format!("/v1/calibrations/{calibration}/report")).await;
     report.problem(409, "calibration_not_ready");
     app.restart_with(&["--workers", "1"]);
     assert_eq!(app.calibrated(&calibration).await["state"], "ready");

@@ -33,7 +33,7 @@ impl TestApp {
     /// Waits for the end of a check, and returns the resource.
     async fn checked(&self, path: &str, id: &str) -> Value {
         for _ in 0..6 {
-            let shown = self.get(&format!("{path}/{id}?wait=20")).await.expect(200).json();
+            let shown = self.wait(&format!("{path}/{id}"), "20").await.expect(200).json();
             if shown["state"] != "preparing" {
                 return shown;
             }

@@ -65,15 +65,20 @@ async fn a_client_can_wait_for_a_job() {
     let job = id(&app.post("/v1/jobs", &body).await.expect(201));
     let path = format!("/v1/jobs/{job}");
     let start = Instant::now();
-    while app.get(&format!("{path}?wait=10")).await.expect(200).json()["state"] != "succeeded" {
+    while app.wait(&path, "10").await.expect(200).json()["state"] != "succeeded" {
         assert!(start.elapsed() < Duration::from_secs(100), "the job does not end");
     }
     let start = Instant::now();
-    app.get(&format!("{path}?wait=20")).await.expect(200);
+    let ended = app.wait(&path, "20").await.expect(200);
     assert!(start.elapsed() < Duration::from_secs(3), "the job had ended");
-    for bad in ["21", "-1", "long", "nan"] {
-        app.get(&format!("{path}?wait={bad}")).await.problem(400, "invalid_query");
+    assert_eq!(ended.header("preference-applied"), "wait=20");
+    let capped = app.wait(&path, "1000").await.expect(200);
+    assert_eq!(capped.header("preference-applied"), "wait=20");
+    for ignored in ["-1", "long", "nan"] {
+        let answer = app.wait(&path, ignored).await.expect(200);
+        assert_eq!(answer.header("preference-applied"), "", "{ignored}");
     }
+    app.get(&format!("{path}?wait=1")).await.problem(400, "invalid_query");
 }
 
 #[tokio::test]
@@ -83,8 +88,9 @@ async fn waiting_clients_do_not_block_others() {
     let body = json!({ "measurement": measurement, "algorithm": "gap-tv" });
     let path = format!("/v1/jobs/{}", id(&app.post("/v1/jobs", &body).await.expect(201)));
     let waiting = |count: usize| {
-        let requests: Vec<_> =
-            (0..count).map(|_| app.request(Method::GET, &format!("{path}?wait=20"))).collect();
+        let requests: Vec<_> = (0..count)
+            .map(|_| app.request(Method::GET, &path).header("prefer", "wait=20"))
+            .collect();
         let sent = requests.into_iter().map(|request| async move { request.send().await.unwrap() });
         tokio::spawn(futures_util::future::join_all(sent))
     };
@@ -94,7 +100,7 @@ async fn waiting_clients_do_not_block_others() {
     let start = Instant::now();
     app.get(&path).await.expect(200);
     assert!(start.elapsed() < Duration::from_secs(2), "{:?}", start.elapsed());
-    let refused = app.get(&format!("{path}?wait=20")).await;
+    let refused = app.wait(&path, "20").await;
     refused.problem(429, "too_many_waiters");
     assert!(!refused.header("retry-after").is_empty());
     // A change wakes all of them.

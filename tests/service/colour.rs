@@ -137,7 +137,8 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     let base = format!("/v1/jobs/{job}/snapshots/1");
 
     // At each of four positions, there is one tile per sub-image.
-    let tiles = app.get(&format!("{base}/tiles")).await.expect(200).json();
+    let tiles =
+        app.get(&format!("{base}/tiles").replace("/v1/", "/view/")).await.expect(200).json();
     let places = tiles["items"].as_array().unwrap().iter().map(|tile| {
         let field = |name: &str| tile[name].as_u64().unwrap();
         (field("row"), field("column"), field("height"), field("width"), field("plane"))
@@ -164,12 +165,17 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     assert!(refused.problem(422, "size_mismatch").contains("4 frames of 64x32"));
 
     // Arrays, and images of them.
-    let frames = app.get(&format!("{base}/frames.npy")).await.expect(200).bytes;
+    let frames = app.get(&format!("{base}/exports/npy")).await.expect(200).bytes;
     assert!(String::from_utf8_lossy(&frames[..128]).contains("(4, 64, 64, 3)"));
     let frames = values(&frames);
-    let sensor = values(&app.get(&format!("{base}/mosaic.npy")).await.expect(200).bytes);
+    let sensor = values(&app.get(&format!("{base}/exports/mosaic")).await.expect(200).bytes);
     assert!(sensor.iter().enumerate().all(|(pixel, value)| frames[at(pixel)] == *value));
-    let picture = app.get(&format!("{base}/pictures/frame-2/tiles/0/0/0?black=0&white=1")).await;
+    let picture = app
+        .get(
+            &format!("{base}/pictures/frame-2/tiles/0/0/0?black=0&white=1")
+                .replace("/v1/", "/view/"),
+        )
+        .await;
     let (rows, columns, shown) = decode(&picture.expect(200));
     assert_eq!((rows, columns), (SIDE, SIDE));
     for (&shown, &value) in shown.iter().zip(&frames[3 * SIDE * SIDE..]) {
@@ -179,11 +185,19 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     let disc = &frames[3 * (30 * SIDE + 14 + 3 * FRAMES)..][..3];
     assert!(disc[0] > disc[1] + 0.2 && disc[1] > disc[2], "{disc:?}");
     for name in ["difference-2", "slice-30"] {
-        decode(&app.get(&format!("{base}/pictures/{name}")).await.expect(200));
+        decode(
+            &app.get(&format!("{base}/pictures/{name}").replace("/v1/", "/view/"))
+                .await
+                .expect(200),
+        );
     }
-    let rest = app.get(&format!("{base}/pictures/residual/spread")).await.expect(200).json();
+    let rest = app
+        .get(&format!("{base}/pictures/residual/spread").replace("/v1/", "/view/"))
+        .await
+        .expect(200)
+        .json();
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
-    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
+    let manifest = app.get(&format!("{base}/exports/manifest")).await.expect(200).json();
     assert_eq!(
         manifest["content"]["colour"],
         json!({"mosaic": "grbg", "demosaicking": "malvar-he-cutler-2004"})
@@ -192,10 +206,10 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     judge_exr(&app.data().join("results").join(&job).join("snapshot_0001"));
 
     // Export formats.
-    let zarr = app.get(&format!("{base}/frames.zarr/zarr.json")).await.expect(200).json();
+    let zarr = app.get(&format!("{base}/exports/zarr/zarr.json")).await.expect(200).json();
     assert_eq!(zarr["shape"], json!([4, 64, 64, 3]));
-    app.get(&format!("{base}/frames.zarr/c/0/0/0")).await.problem(404, "not_found");
-    let chunk = app.get(&format!("{base}/frames.zarr/c/3/0/0/0")).await.expect(200).bytes;
+    app.get(&format!("{base}/exports/zarr/c/0/0/0")).await.problem(404, "not_found");
+    let chunk = app.get(&format!("{base}/exports/zarr/c/3/0/0/0")).await.expect(200).bytes;
     assert_eq!(chunk.len(), SIDE * SIDE * 3 * 4);
     judge_movies(&app, (&job, SNAPSHOTS), &token).await;
     if let Some(python) = judges() {
@@ -279,7 +293,7 @@ async fn a_grey_scene_behind_a_mosaic_stays_grey() {
     let measurement = lab.measure(&app, "bggr").await;
     let job = app.submit(&tv(&measurement)).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    let frames = app.get(&format!("/v1/jobs/{job}/snapshots/0/frames.npy")).await.expect(200);
+    let frames = app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/npy")).await.expect(200);
     let frames = values(&frames.bytes);
     let pixels = frames.chunks_exact(3);
     let mut means = [0.0; 3];

@@ -102,12 +102,16 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     ] {
         let (subfolder, name) = file.split_once('/').unwrap_or(("", file));
         let path = match (subfolder, name) {
-            ("", "sequence.npy") => "sequence/frames.npy".to_owned(),
-            ("", _) => "sequence/movie.mp4".to_owned(),
+            ("", "sequence.npy") => "exports/npy".to_owned(),
+            ("", _) => "exports/mp4".to_owned(),
             _ => {
-                let name = name.replace("png/frame_0003", "frames/3");
-                let name = name.replace("stack-sigma.exr", "stack.exr?layers=sigma");
-                format!("snapshots/{}/{name}", &subfolder[12..])
+                let format = match name {
+                    "frames.npy" => "npy",
+                    "png/frame_0003.png" => "frames/3.png",
+                    "movie.mp4" => "mp4",
+                    _ => "exr?layers=sigma",
+                };
+                format!("snapshots/{}/exports/{format}", &subfolder[12..])
             }
         };
         let served = app.get(&format!("/v1/jobs/{job}/{path}")).await.expect(200).bytes;
@@ -448,7 +452,7 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
         assert!(std::fs::read_to_string(report).unwrap().starts_with(label.as_str()));
         let result = bench.join(format!("{label}.result/snapshot_0000/frames.npy"));
         let job = jobs.iter().find(|job| job["label"] == label.as_str()).unwrap();
-        let path = format!("/v1/jobs/{}/snapshots/0/frames.npy", job["id"].as_str().unwrap());
+        let path = format!("/v1/jobs/{}/snapshots/0/exports/npy", job["id"].as_str().unwrap());
         assert!(std::fs::read(&result).unwrap() == app.get(&path).await.expect(200).bytes);
     }
     assert!(parts(&bench).is_empty());

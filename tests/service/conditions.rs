@@ -23,7 +23,7 @@ async fn if_match_makes_a_request_conditional() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    let frames = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
+    let frames = format!("/v1/jobs/{job}/snapshots/0/exports/npy");
     for path in [frames.clone(), format!("/v1/jobs/{job}")] {
         let etag = app.get(&path).await.expect(200).header("etag").to_owned();
         let with = |tag: &str| app.request(Method::GET, &path).header("if-match", tag);

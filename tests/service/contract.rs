@@ -61,7 +61,9 @@ fn operation<'a>(method: &Method, path: &str) -> Option<&'a Value> {
     let name = method.as_str().to_ascii_lowercase();
     let fits = |template: &str| {
         let (ours, theirs) = (path.split('/'), template.split('/'));
-        ours.clone().count() == theirs.clone().count()
+        // The rest of a path in a tree.
+        let tree = template.ends_with("/{path}") && ours.clone().count() > theirs.clone().count();
+        (tree || ours.clone().count() == theirs.clone().count())
             && ours.zip(theirs).all(|(part, pattern)| pattern.starts_with('{') || part == pattern)
     };
     let paths = CONTRACT["paths"].as_object().unwrap().iter();
@@ -78,10 +80,17 @@ async fn the_contract_is_served_and_its_references_resolve() {
     let answer = app.get("/openapi.yaml").await.expect(200);
     let contract: Value = serde_yaml_ng::from_slice(&answer.bytes).unwrap();
     assert!(contract["openapi"].as_str().unwrap().starts_with("3."));
+    let json = app.get("/openapi.json").await.expect(200).json();
+    assert_eq!(
+        json,
+        serde_yaml_ng::from_str::<Value>(&String::from_utf8_lossy(&answer.bytes)).unwrap()
+    );
+    let packed = app.request(Method::GET, "/openapi.yaml").header("accept-encoding", "gzip");
+    assert_eq!(app.send(packed).await.expect(200).header("content-encoding"), "gzip");
     // Every reference resolves.
     let text = String::from_utf8(answer.bytes).unwrap();
-    for reference in text.split("$ref: \"#/").skip(1) {
-        let path = reference.split('"').next().unwrap();
+    for reference in text.split("$ref: '#/").skip(1) {
+        let path = reference.split('\'').next().unwrap();
         let value = path.split('/').fold(&contract, |at, key| &at[key]);
         assert!(!value.is_null(), "{path} leads nowhere");
     }
@@ -92,8 +101,9 @@ async fn every_error_type_has_a_page() {
     let app = TestApp::start().await;
     let refused = app.post("/v1/jobs", &json!({})).await;
     refused.problem(422, "invalid_request");
-    let path = refused.json()["type"].as_str().unwrap().to_owned();
-    let page = app.get(&path).await.expect(200);
+    let (place, _) = refused.header("link").split_once('>').unwrap();
+    assert_eq!(place, "<../problems/invalid_request", "relative to the address of the request");
+    let page = app.get("/problems/invalid_request").await.expect(200);
     assert!(page.header("content-type").starts_with("text/html"));
     assert!(page.header("content-security-policy").contains("default-src 'none'"));
     assert!(String::from_utf8_lossy(&page.bytes).contains("invalid_request"));
@@ -106,8 +116,7 @@ fn the_dashboard_names_every_stage_of_the_contract() {
         std::fs::read_to_string(format!("{}/{path}", env!("CARGO_MANIFEST_DIR"))).unwrap()
     };
     let contract: Value = serde_yaml_ng::from_str(&read("openapi.yaml")).unwrap();
-    let stages =
-        &contract["components"]["schemas"]["Progress"]["properties"]["stage"]["x-extensible-enum"];
+    let stages = &contract["components"]["schemas"]["ProgressStage"]["x-extensible-enum"];
     let script = read("src/http/dashboard/format.js");
     let (_, words) = script.split_once("const words = {").unwrap();
     let (words, _) = words.split_once('}').unwrap();

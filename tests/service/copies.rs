@@ -86,7 +86,7 @@ async fn a_damaged_result_is_not_served_and_is_computed_again() {
     let app = TestApp::with(&["--workers", "1", "--scrub-bytes", "0"]).await;
     let (_, job) = done(&app).await;
     let before = results(&app, &job).await;
-    let path = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
+    let path = format!("/v1/jobs/{job}/snapshots/0/exports/npy");
     let etag = app.get(&path).await.expect(200).header("etag").to_owned();
     let address = format!("/v1/jobs/{job}/retry");
     let retry = async || app.post(&address, &json!({})).await;
@@ -98,11 +98,11 @@ async fn a_damaged_result_is_not_served_and_is_computed_again() {
     assert!(detail.contains("frames.npy") && detail.contains("retry"), "{detail}");
     let range = app.request(reqwest::Method::GET, &path).header("range", "bytes=0-9");
     app.send(range).await.problem(500, "file_damaged");
-    app.get(&format!("/v1/jobs/{job}/snapshots/0/pictures/frame-1"))
+    app.get(&format!("/view/jobs/{job}/snapshots/0/pictures/frame-1"))
         .await
         .problem(500, "file_damaged");
     // Intact files are served, and a client with the right bytes gets 304.
-    app.get(&format!("/v1/jobs/{job}/snapshots/0/stack.exr")).await.expect(200);
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/exr")).await.expect(200);
     let known = app.request(reqwest::Method::GET, &path).header("if-none-match", &etag);
     app.send(known).await.expect(304);
     let (good, found) = verify(app.data());
@@ -155,7 +155,7 @@ async fn a_damaged_upload_is_not_used() {
 async fn the_periodic_check_finds_silent_damage() {
     let app = TestApp::with(&["--workers", "1", "--scrub-bytes", "0"]).await;
     let (_, job) = done(&app).await;
-    let path = format!("/v1/jobs/{job}/snapshots/0/frames.npy");
+    let path = format!("/v1/jobs/{job}/snapshots/0/exports/npy");
     let app = app.again(&["--workers", "0", "--scrub-bytes", "1000000000"]).await;
     app.get(&path).await.expect(200);
     // The first check may be over, so its time is set back by a day.
@@ -173,7 +173,7 @@ async fn the_periodic_check_finds_silent_damage() {
         assert!(start.elapsed().as_secs() < 60, "the flipped bit is not found");
     }
     app.get(&path).await.problem(500, "file_damaged");
-    app.get(&format!("/v1/jobs/{job}/snapshots/1/frames.npy")).await.expect(200);
+    app.get(&format!("/v1/jobs/{job}/snapshots/1/exports/npy")).await.expect(200);
 }
 
 #[tokio::test]

@@ -27,9 +27,10 @@ async fn a_deep_job_runs_and_records_model_and_provider() {
     assert_eq!(done["state"], "succeeded", "{done:#}");
     assert_eq!(done["progress"]["passes_done"], 3);
     let base = format!("/v1/jobs/{job}/snapshots/0");
-    let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json().to_string();
+    let manifest =
+        app.get(&format!("{base}/exports/manifest")).await.expect(200).json().to_string();
     assert!(manifest.contains("fastdvdnet") && manifest.contains("CPU"), "{manifest}");
-    let frames = values(&app.get(&format!("{base}/frames.npy")).await.expect(200).bytes);
+    let frames = values(&app.get(&format!("{base}/exports/npy")).await.expect(200).bytes);
     assert!(frames.iter().all(|value| value.is_finite()));
 }
 

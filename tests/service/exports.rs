@@ -37,7 +37,7 @@ async fn other_programs_read_all_exports_bit_for_bit() {
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(report["intervals"]["/snapshots/1"], json!([0.004, 0.004]));
     // The camera pauses between the snapshots.
-    assert_eq!(report["intervals"]["/sequence"], json!([null, null]));
+    assert_eq!(report["intervals"][""], json!([null, null]));
     assert_eq!(report["members"], 2 * 12 + 1);
 }
 
@@ -48,19 +48,19 @@ async fn exports_support_caching_and_ranges_like_files() {
     let stuck = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
         {"prior": "tv", "iterations": 10_000, "tv_weight": 0.05, "tv_updates": 40}]}});
     let stuck = app.submit(&stuck).await;
-    let paths = ["sequence/stack.tif", "sequence/frames.npy", "results.zip"];
-    let zarr = ["sequence/frames.zarr/zarr.json", "snapshots/0/frames.zarr/c/0/0/0"];
+    let paths = ["exports/tiff", "exports/npy", "exports/zip"];
+    let zarr = ["exports/zarr/zarr.json", "snapshots/0/exports/zarr/c/0/0/0"];
     for path in paths.iter().chain(&zarr) {
         app.get(&format!("/v1/jobs/{stuck}/{path}")).await.problem(404, "not_ready");
     }
     app.post(&format!("/v1/jobs/{stuck}/cancel"), &json!({})).await.expect(202);
     let job = done(&app).await;
-    app.get(&format!("/v1/jobs/{job}/snapshots/2/stack.tif")).await.problem(404, "not_found");
+    app.get(&format!("/v1/jobs/{job}/snapshots/2/exports/tiff")).await.problem(404, "not_found");
     for chunk in ["c/8/0/0", "c/-1/0/0", "c/0/1/0", ".zarray"] {
-        let path = format!("/v1/jobs/{job}/sequence/frames.zarr/{chunk}");
+        let path = format!("/v1/jobs/{job}/exports/zarr/{chunk}");
         app.get(&path).await.problem(404, "not_found");
     }
-    for path in paths.iter().chain(&zarr[1..]).chain(&["snapshots/1/stack.tif"]) {
+    for path in paths.iter().chain(&zarr[1..]).chain(&["snapshots/1/exports/tiff"]) {
         let path = format!("/v1/jobs/{job}/{path}");
         let complete = app.get(&path).await.expect(200);
         let (size, etag) = (complete.bytes.len(), complete.header("etag").to_owned());
@@ -82,8 +82,8 @@ async fn exports_support_caching_and_ranges_like_files() {
         assert!(joined == complete.bytes, "{path}");
     }
     // Equal results give equal bytes.
-    let archive = app.get(&format!("/v1/jobs/{job}/results.zip")).await.bytes;
-    assert_eq!(archive, app.get(&format!("/v1/jobs/{job}/results.zip")).await.bytes);
+    let archive = app.get(&format!("/v1/jobs/{job}/exports/zip")).await.bytes;
+    assert_eq!(archive, app.get(&format!("/v1/jobs/{job}/exports/zip")).await.bytes);
 
     // A damaged file is not sent.
     let results = app.data().join("results").join(&job);
@@ -92,12 +92,12 @@ async fn exports_support_caching_and_ranges_like_files() {
     let last = bytes.len() - 1;
     bytes[last] ^= 1;
     std::fs::write(&array, bytes).unwrap();
-    for path in ["snapshots/1/stack.tif", "snapshots/1/frames.zarr/c/3/0/0"] {
+    for path in ["snapshots/1/exports/tiff", "snapshots/1/exports/zarr/c/3/0/0"] {
         app.get(&format!("/v1/jobs/{job}/{path}")).await.problem(500, "file_damaged");
     }
-    app.get(&format!("/v1/jobs/{job}/snapshots/0/stack.tif")).await.expect(200);
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/tiff")).await.expect(200);
     let cut =
-        app.request(Method::GET, &format!("/v1/jobs/{job}/results.zip")).send().await.unwrap();
+        app.request(Method::GET, &format!("/v1/jobs/{job}/exports/zip")).send().await.unwrap();
     assert!(cut.bytes().await.is_err(), "the archive breaks off before the damaged file");
 }
 
@@ -129,6 +129,11 @@ async fn another_decoder_reads_the_frames_of_movies() {
 }
 
 impl TestApp {
+    async fn create_movie(&self, job: &str, snapshot: Option<u32>) -> Answer {
+        let body = json!({"format": "mp4", "snapshot": snapshot});
+        self.post(&format!("/v1/jobs/{job}/exports"), &body).await
+    }
+
     /// The first answer to a request for a movie that is not 202.
     async fn movie(&self, path: &str) -> Answer {
         loop {
@@ -163,23 +168,36 @@ async fn a_movie_is_encoded_on_request_and_stored_like_a_result() {
     let stuck = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
         {"prior": "tv", "iterations": 10_000, "tv_weight": 0.05, "tv_updates": 40}]}});
     let stuck = app.submit(&stuck).await;
-    for path in ["snapshots/0", "sequence"] {
-        app.get(&format!("/v1/jobs/{stuck}/{path}/movie.mp4")).await.problem(404, "not_ready");
+    for path in ["snapshots/0/", ""] {
+        let path = format!("/v1/jobs/{stuck}/{path}exports/mp4");
+        app.get(&path).await.problem(404, "not_ready");
     }
     app.post(&format!("/v1/jobs/{stuck}/cancel"), &json!({})).await.expect(202);
     let job = done(&app).await;
-    let path = format!("/v1/jobs/{job}/snapshots/1/movie.mp4");
-    let sequence = format!("/v1/jobs/{job}/sequence/movie.mp4");
+    let path = format!("/v1/jobs/{job}/snapshots/1/exports/mp4");
+    let sequence = format!("/v1/jobs/{job}/exports/mp4");
 
-    // No movie is encoded before the first request, nor without a worker.
+    // No movie is encoded before it is created, nor without a worker.
     let before = app.kept().await;
     app.restart_with(&["--workers", "0"]);
-    let first = app.get(&path).await.expect(202);
+    app.get(&path).await.problem(404, "not_found");
+    let first = app.create_movie(&job, Some(1)).await.expect(202);
     assert_eq!(first.json(), json!({"state": "waiting", "percent": 0.0}));
+    assert_eq!(first.header("location"), path);
+    assert_eq!(app.create_movie(&job, Some(1)).await.expect(202).json(), first.json());
+    assert_eq!(app.get(&path).await.expect(202).json(), first.json());
+    let wrong = app.create_movie(&job, Some(2)).await;
+    wrong.problem(422, "invalid_request");
+    assert_eq!(wrong.json()["pointer"], "/snapshot");
+    let body = json!({"format": "tiff"});
+    let body = app.post(&format!("/v1/jobs/{job}/exports"), &body).await;
+    body.problem(422, "invalid_request");
     assert_eq!(app.get(&format!("/v1/jobs/{job}")).await.json()["state"], "succeeded");
     app.restart_with(&["--workers", "1"]);
 
     let movie = app.movie(&path).await.expect(200);
+    let exists = app.create_movie(&job, Some(1)).await.expect(200);
+    assert_eq!(exists.json(), json!({"state": "ready", "percent": 100.0}));
     let (size, etag) = (movie.bytes.len(), movie.header("etag").to_owned());
     assert_eq!(movie.header("content-type"), "video/mp4");
     assert!(movie.header("content-disposition").ends_with("_0001_movie.mp4\""), "{movie:?}");
@@ -200,21 +218,26 @@ async fn a_movie_is_encoded_on_request_and_stored_like_a_result() {
     let mut bytes = movie.bytes.clone();
     bytes[size / 2] ^= 1;
     std::fs::write(&file, bytes).unwrap();
-    app.get(&path).await.expect(202);
+    app.get(&path).await.problem(404, "not_found");
+    app.create_movie(&job, Some(1)).await.expect(202);
     assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
 
     // Damaged frames have no movie. The answer says so, and a retry of the job restores it.
     let array = app.data().join("results").join(&job).join("snapshot_0000/frames.npy");
     let original = std::fs::read(&array).unwrap();
     std::fs::write(&array, &original[..original.len() - 1]).unwrap();
+    app.create_movie(&job, None).await.expect(202);
     let detail = app.movie(&sequence).await.problem(500, "movie_failed");
     assert!(detail.contains("frames.npy is damaged: retry the job"), "{detail}");
-    app.get(&sequence).await.expect(202);
+    app.get(&sequence).await.problem(500, "movie_failed");
+    app.create_movie(&job, None).await.expect(202);
     app.movie(&sequence).await.problem(500, "movie_failed");
-    app.get(&format!("/v1/jobs/{job}/snapshots/0/frames.npy")).await.problem(500, "file_damaged");
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/npy")).await.problem(500, "file_damaged");
     app.post(&format!("/v1/jobs/{job}/retry"), &json!({})).await.expect(202);
     assert_eq!(app.ended(&job).await["state"], "succeeded");
     assert!(!file.exists(), "a retry deletes the movies of the old results");
+    app.create_movie(&job, None).await.expect(202);
+    app.create_movie(&job, Some(1)).await.expect(202);
     let both = app.movie(&sequence).await.expect(200);
     assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
 
@@ -231,8 +254,9 @@ async fn the_smallest_frames_have_no_movie() {
         app.scene(&Scene { frames: 2, height: 48, width: 12, snapshots: 1 }).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    let path = format!("/v1/jobs/{job}/sequence/movie.mp4");
-    let detail = app.get(&path).await.problem(404, "not_found");
+    let path = format!("/v1/jobs/{job}/exports/mp4");
+    app.get(&path).await.problem(404, "not_found");
+    let detail = app.create_movie(&job, None).await.problem(404, "not_found");
     assert!(detail.contains("48x12") && detail.contains("below 16"), "{detail}");
 }
 
@@ -243,6 +267,10 @@ async fn a_lab_without_space_gets_no_movie() {
     app.sign_in(&token);
     let job = done(&app).await;
     entitle(&app, &["a", "--bytes", "1"]);
-    let path = format!("/v1/jobs/{job}/sequence/movie.mp4");
-    app.get(&path).await.problem(507, "quota_exceeded");
+    app.create_movie(&job, None).await.problem(403, "quota_exceeded");
+    // A reader creates nothing.
+    let reader = app.token(&["create", "--lab", "a", "--role", "read"]);
+    app.sign_in(&reader);
+    app.create_movie(&job, None).await.problem(403, "forbidden");
+    app.get(&format!("/v1/jobs/{job}/exports/mp4")).await.problem(404, "not_found");
 }

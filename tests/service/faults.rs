@@ -156,9 +156,9 @@ async fn random_kills_change_no_result() {
 /// True if all downloads have the expected bytes.
 async fn downloads(app: &TestApp, job: &str, expected: &BTreeMap<String, String>) -> bool {
     for snapshot in 0..Scene::SMALL.snapshots {
-        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy");
+        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/npy");
         let bytes = app.get(&path).await.expect(200).bytes;
-        if sha256(&bytes) != expected[&format!("{snapshot}/frames.npy")] {
+        if sha256(&bytes) != expected[&format!("{snapshot}/exports/npy")] {
             return false;
         }
     }

@@ -62,6 +62,18 @@ async fn a_task_that_kills_its_workers_is_abandoned() {
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
     assert!(error.contains("SIGABRT") && error.contains("(3 attempts)"), "{error}");
+    // The job and the list state the same problem.
+    let problem = &done["problem"];
+    assert_eq!(problem["code"], "worker_crashed", "{problem:#}");
+    assert_eq!(problem["detail"], error);
+    assert_eq!(
+        (&problem["stage"], &problem["snapshot"], &problem["tile"]),
+        (&json!("tile"), &json!(0), &json!(0))
+    );
+    assert_eq!((&problem["attempts"], &problem["retryable"]), (&json!(3), &json!(true)));
+    assert!(problem["remedy"].as_str().unwrap().contains("Retry the job"), "{problem:#}");
+    let list = app.get("/v1/jobs").await.expect(200).json();
+    assert_eq!(list["items"][0]["problem"], *problem);
 }
 
 #[tokio::test]

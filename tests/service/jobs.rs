@@ -34,13 +34,13 @@ async fn an_accepted_job_has_all_defaults_filled_in() {
     assert_eq!(job["schedule"], named["schedule"]);
     let snapshot = format!("/v1/jobs/{}/snapshots/1", id(&created));
     assert_eq!(app.get(&snapshot).await.expect(200).json()["ready"], false);
-    for file in ["frames/1.exr", "frames/4.png", "stack.exr", "frames.npy", "manifest.json"] {
-        app.get(&format!("{snapshot}/{file}")).await.problem(404, "not_ready");
+    for file in ["frames/1.exr", "frames/4.png", "exr", "npy", "manifest"] {
+        app.get(&format!("{snapshot}/exports/{file}")).await.problem(404, "not_ready");
     }
     for file in ["frames/5.exr", "frames/0.exr", "frames/1.tiff", "frames/..%2F..%2F1.exr"] {
-        app.get(&format!("{snapshot}/{file}")).await.problem(404, "not_found");
+        app.get(&format!("{snapshot}/exports/{file}")).await.problem(404, "not_found");
     }
-    let beyond = format!("/v1/jobs/{}/snapshots/2/stack.exr", id(&created));
+    let beyond = format!("/v1/jobs/{}/snapshots/2/exports/exr", id(&created));
     app.get(&beyond).await.problem(404, "not_found");
 }
 

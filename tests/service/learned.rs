@@ -91,13 +91,13 @@ async fn a_labs_network_reconstructs_frames() {
             (&model["id"], &json!(tiles))
         );
         let base = format!("/v1/jobs/{job}/snapshots/0");
-        let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
+        let manifest = app.get(&format!("{base}/exports/manifest")).await.expect(200).json();
         let recorded = json!([{"name": "tiny", "sha256": model["file"]}]);
         assert_eq!(manifest["content"]["models"], recorded);
         assert_eq!(manifest["run"]["provider"], "CPUExecutionProvider");
-        let frames = app.get(&format!("{base}/frames.npy")).await.expect(200);
+        let frames = app.get(&format!("{base}/exports/npy")).await.expect(200);
         quality.push(psnr(scene, 0, &values(&frames.bytes)));
-        app.get(&format!("{base}/frames/4.exr")).await.expect(200);
+        app.get(&format!("{base}/exports/frames/4.exr")).await.expect(200);
         let used = app.delete(&format!("/v1/models/{}", model["id"].as_str().unwrap())).await;
         assert!(used.problem(409, "in_use").contains("1 jobs"));
         app.delete(&format!("/v1/jobs/{job}")).await.expect(204);

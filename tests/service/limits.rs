@@ -51,7 +51,7 @@ async fn concurrent_requests_do_not_exceed_the_limit() {
     let answers = join_all((0..14).map(upload)).await;
     assert_eq!(count_created(&answers), 3);
     for answer in answers.iter().filter(|answer| answer.status.as_u16() != 201) {
-        answer.problem(507, "quota_exceeded");
+        answer.problem(403, "quota_exceeded");
     }
     let answers = join_all((0..20).map(|_| app.send(announce(&app, 90_000)))).await;
     assert_eq!(count_created(&answers), 1, "100,000 bytes were free");
@@ -64,12 +64,12 @@ async fn prepared_arrays_count_towards_the_quota() {
     // A value has 8 bits in the upload, and 32 in the prepared array.
     let masks = [npy_header("|u1", &[8, 96, 96]), vec![200; 8 * 96 * 96]].concat();
     let answer = app.calibrate(masks.clone()).await;
-    let detail = answer.problem(507, "quota_exceeded");
+    let detail = answer.problem(403, "quota_exceeded");
     assert!(detail.contains("294944"), "{detail}");
     assert_eq!(std::fs::read_dir(app.data().join("tmp")).unwrap().count(), 0);
     app.sign_in(&app.token(&["create", "--lab", "b", "--max-bytes", "400000"]));
     app.calibrate(masks).await.expect(201);
-    app.send(announce(&app, 50_000)).await.problem(507, "quota_exceeded");
+    app.send(announce(&app, 50_000)).await.problem(403, "quota_exceeded");
     app.send(announce(&app, 30_000)).await.expect(201);
 }
 
@@ -129,7 +129,7 @@ async fn a_lab_has_quotas_that_do_not_affect_other_labs() {
     let detail = app.post("/v1/jobs", &jobs[1]).await.problem(429, "queue_full");
     assert!(detail.contains("of this lab"), "{detail}");
     entitle(&app, &["b", "--jobs", "none", "--bytes", "1000000"]);
-    let detail = app.post("/v1/jobs", &jobs[1]).await.problem(507, "quota_exceeded");
+    let detail = app.post("/v1/jobs", &jobs[1]).await.problem(403, "quota_exceeded");
     assert!(detail.contains("the lab keeps"), "{detail}");
     entitle(&app, &["b", "--bytes", "none", "--share", "2"]);
     app.submit(&jobs[1]).await;

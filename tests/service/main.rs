@@ -5,6 +5,7 @@
 mod access;
 mod adaptive;
 mod all_labs;
+mod api;
 mod app;
 mod assessment;
 mod calibration;

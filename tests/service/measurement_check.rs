@@ -79,7 +79,7 @@ async fn a_measurement_is_checked_against_its_calibration() {
     let done = app.ended(&job).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
     assert_eq!(codes(&done), ["shifted_masks"]);
-    for path in ["manifest.json", "snapshots/0/manifest.json"] {
+    for path in ["exports/manifest", "snapshots/0/exports/manifest"] {
         let manifest = app.get(&format!("/v1/jobs/{job}/{path}")).await.expect(200).json();
         assert_eq!(codes(&manifest["content"]), ["shifted_masks"], "{path}");
     }
@@ -148,7 +148,7 @@ async fn a_job_warns_of_a_bad_calibration_and_of_shifted_masks() {
         codes.filter(|code| code == "bad_calibration").count()
     };
     assert_eq!(warned(&app.ended(&early).await), 1, "the report is finished after the job");
-    let report = app.get(&format!("/v1/calibrations/{calibration}/report.json")).await.expect(200);
+    let report = app.get(&format!("/v1/calibrations/{calibration}/report")).await.expect(200);
     assert_eq!(report.json()["grade"], "bad");
     let codes: Vec<String> =
         codes_and_frames(&report.json()["findings"]).into_iter().map(|(code, _)| code).collect();

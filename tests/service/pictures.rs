@@ -38,10 +38,10 @@ async fn images_show_the_frames_unchanged() {
     let job = job(&app, tv(200, 4)).await;
     let done = app.ended(&job).await;
     let base = format!("/v1/jobs/{job}/snapshots/1");
-    let frames = values(&app.get(&format!("{base}/frames.npy")).await.expect(200).bytes);
+    let frames = values(&app.get(&format!("{base}/exports/npy")).await.expect(200).bytes);
     let (height, width) = (Scene::SMALL.height, Scene::SMALL.width);
     let plane = height * width;
-    let pictures = format!("{base}/pictures");
+    let pictures = format!("{base}/pictures").replace("/v1/", "/view/");
 
     // A tile at full resolution has every pixel, on the scale of the window.
     let address = format!("{pictures}/frame-2/tiles/0/0/0?black=0.1&white=0.9");
@@ -78,11 +78,11 @@ async fn images_show_the_frames_unchanged() {
 
     // Masks and measurement have images too.
     let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
-    let masks = format!("/v1/calibrations/{}/pictures", calibration.as_str().unwrap());
+    let masks = format!("/view/calibrations/{}/pictures", calibration.as_str().unwrap());
     for name in ["mask-4", "mean", "gram", "dead"] {
         decode(&app.get(&format!("{masks}/{name}")).await.expect(200));
     }
-    let measured = format!("/v1/measurements/{}/pictures", measurement.as_str().unwrap());
+    let measured = format!("/view/measurements/{}/pictures", measurement.as_str().unwrap());
     decode(&app.get(&format!("{measured}/snapshot-1")).await.expect(200));
 
     for (path, status, code) in [
@@ -148,7 +148,7 @@ async fn running_jobs_show_tiles_and_their_convergence() {
     let job = job(&app, tv(5_000, 8)).await;
     let base = format!("/v1/jobs/{job}/snapshots/1");
     let waits = self::job(&app, tv(5_000, 8)).await;
-    let picture = format!("/v1/jobs/{waits}/snapshots/1/pictures/frame-1");
+    let picture = format!("/view/jobs/{waits}/snapshots/1/pictures/frame-1");
     app.get(&picture).await.problem(404, "not_ready");
     app.when(&job, |job| {
         job["progress"]["tiles_done"].as_u64() >= Some(1)
@@ -156,21 +156,29 @@ async fn running_jobs_show_tiles_and_their_convergence() {
             && job["progress"]["percent"].as_f64() < Some(90.0)
     })
     .await;
-    let part = app.get(&format!("{base}/pictures/frame-1")).await.expect(200);
+    let part =
+        app.get(&format!("{base}/pictures/frame-1").replace("/v1/", "/view/")).await.expect(200);
     assert_eq!(part.header("cache-control"), "no-cache");
-    let tiles = app.get(&format!("{base}/tiles")).await.expect(200).json();
+    let tiles =
+        app.get(&format!("{base}/tiles").replace("/v1/", "/view/")).await.expect(200).json();
     let tiles = tiles["items"].as_array().unwrap();
     assert_eq!(tiles.len(), 6);
     assert_eq!(tiles[0]["state"], "done");
     assert!(tiles[0]["residual"].as_f64().unwrap() < 1.0);
     assert_eq!(tiles[5]["residual"], Value::Null);
-    let history = app.get(&format!("{base}/tiles/0/history")).await.expect(200).json();
+    let history = app
+        .get(&format!("{base}/tiles/0/history").replace("/v1/", "/view/"))
+        .await
+        .expect(200)
+        .json();
     let points = history["points"].as_array().unwrap();
     assert!((64..=129).contains(&points.len()), "{}", points.len());
     assert_eq!((&points[0][0], &points[0][3]), (&json!(1), &Value::Null));
     assert_eq!(points.last().unwrap()[0], 5_000);
     assert!(points[0][1].as_f64() > points.last().unwrap()[1].as_f64(), "the residual falls");
-    app.get(&format!("{base}/tiles/6/history")).await.problem(404, "not_found");
+    app.get(&format!("{base}/tiles/6/history").replace("/v1/", "/view/"))
+        .await
+        .problem(404, "not_found");
     for job in [waits, job] {
         app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
         app.ended(&job).await;
@@ -184,8 +192,11 @@ async fn a_coarse_preview_precedes_the_tiles() {
     let preview = |job: &Value| job["progress"]["previews_done"] == 1;
     let early = app.when(&job, preview).await;
     assert_eq!(early["progress"]["tiles_done"], 0, "{early:#}");
-    let base = format!("/v1/jobs/{job}/snapshots/1/pictures/frame-3");
-    let picture = app.get(&format!("{base}/tiles/0/0/0?black=0&white=1")).await.expect(200);
+    let base = format!("/view/jobs/{job}/snapshots/1/pictures/frame-3");
+    let picture = app
+        .get(&format!("{base}/tiles/0/0/0?black=0&white=1").replace("/v1/", "/view/"))
+        .await
+        .expect(200);
     assert_eq!(picture.header("cache-control"), "no-cache");
     let (height, width, shown) = decode(&picture);
     let difference = |i: usize, j: usize| {

@@ -70,7 +70,7 @@ async fn a_job_reconstructs_the_scene() {
     assert_eq!(done["progress"]["eta_seconds"], Value::Null);
     for snapshot in 0..2 {
         let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
-        let frames = values(&app.get(&format!("{base}/frames.npy")).await.expect(200).bytes);
+        let frames = values(&app.get(&format!("{base}/exports/npy")).await.expect(200).bytes);
         assert_eq!(frames.len(), 4 * 48 * 64);
         let psnr = psnr(scene, snapshot, &frames);
         assert!(psnr > 24.0, "{psnr} dB");
@@ -88,7 +88,7 @@ async fn a_job_reconstructs_the_scene() {
             );
         }
     }
-    let manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200);
+    let manifest = app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200);
     assert!(manifest.json().is_object());
     assert_eq!(manifest.header("content-type"), "application/json");
     // A succeeded job keeps uploads, prepared arrays and results, but no tiles.
@@ -106,8 +106,10 @@ async fn results_are_downloaded_in_ranges() {
     let body = json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 1});
     let job = app.submit(&body).await;
     app.ended(&job).await;
-    let path = format!("/v1/jobs/{job}/snapshots/1/frames/2.exr");
-    app.get(&format!("/v1/jobs/{job}/snapshots/0/frames/2.exr")).await.problem(404, "not_found");
+    let path = format!("/v1/jobs/{job}/snapshots/1/exports/frames/2.exr");
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/frames/2.exr"))
+        .await
+        .problem(404, "not_found");
     let complete = app.get(&path).await.expect(200);
     assert_eq!(complete.header("content-type"), "image/x-exr");
     assert_eq!(complete.header("accept-ranges"), "bytes");

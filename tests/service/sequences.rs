@@ -27,7 +27,7 @@ async fn done(app: &TestApp, body: &Value) -> (String, Value) {
     let job = app.submit(body).await;
     let ended = app.ended(&job).await;
     assert_eq!(ended["state"], "succeeded", "{ended:#}");
-    let manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    let manifest = app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
     (job, manifest["content"].clone())
 }
 
@@ -44,7 +44,8 @@ async fn a_sequence_is_reconstructed_jointly_and_blended() {
     assert!(joints.iter().any(|joint| joint["together"] == true), "{joints:#?}");
     let shown = app.get(&format!("/v1/jobs/{together}")).await.expect(200).json();
     assert_eq!((&shown["sequence"], &shown["run"]["length"]), (&json!("contiguous"), &json!(5)));
-    let tiles = app.get(&format!("/v1/jobs/{together}/snapshots/3/tiles")).await.expect(200).json();
+    let tiles =
+        app.get(&format!("/view/jobs/{together}/snapshots/3/tiles")).await.expect(200).json();
     let tiles = tiles["items"].as_array().unwrap();
     let runs: Vec<_> = tiles.iter().map(|tile| &tile["snapshots"]["first"]).collect();
     assert_eq!(runs.len() % 2, 0);

@@ -93,6 +93,7 @@ async fn listeners_receive_changes_of_calibrations() {
         loop {
             let event = text.split_once(mark).and_then(|(_, rest)| rest.split_once("\n\n"));
             if let Some((data, rest)) = event {
+                let data = data.lines().next().unwrap_or_default();
                 let data = serde_json::from_str(data).unwrap_or(Value::Null);
                 text = rest.to_owned();
                 return data;
@@ -136,7 +137,7 @@ async fn an_upload_has_a_preview_before_it_is_used() {
     let frame = |k: usize, at: usize| if k == 1 { at as f32 / 6000.0 } else { 0.0 };
     let values = (0..3).flat_map(|k| (0..60 * 100).map(move |at| frame(k, at)));
     let sha256 = app.upload(npy(&[3, 60, 100], values)).await;
-    let path = format!("/v1/blobs/{sha256}/pictures");
+    let path = format!("/view/blobs/{sha256}/pictures");
     let picture = app.get(&format!("{path}/frame-2?size=64&black=0&white=1")).await.expect(200);
     let shown = image::load_from_memory(&picture.bytes).unwrap().to_luma8();
     assert_eq!(shown.dimensions(), (50, 30), "no side above 64");
@@ -149,7 +150,7 @@ async fn an_upload_has_a_preview_before_it_is_used() {
     assert!(outside.contains("1 to 3"), "{outside}");
     app.get(&format!("{path}/frame-0")).await.problem(404, "not_found");
     let text = app.upload(b"no picture at all".to_vec()).await;
-    let refused = app.get(&format!("/v1/blobs/{text}/pictures/frame-1")).await;
+    let refused = app.get(&format!("/view/blobs/{text}/pictures/frame-1")).await;
     refused.problem(422, "invalid_content");
     app.sign_in(&b);
     app.get(&format!("{path}/frame-2")).await.problem(404, "not_found");
@@ -174,7 +175,7 @@ async fn masks_that_code_only_one_direction_are_not_good() {
     let noise = |k: usize, i: usize| ((k * 7919 + i * 104_729 + i * i * 31) % 97) as f32 / 96.0;
     let values = (0..8).flat_map(|k| (0..64 * 80).map(move |at| noise(k, at / 80)));
     let calibration = id(&app.calibrate(npy(&[8, 64, 80], values)).await.expect(201));
-    let path = format!("/v1/calibrations/{calibration}/report.json");
+    let path = format!("/v1/calibrations/{calibration}/report");
     let mut report = app.get(&path).await;
     for _ in 0..200 {
         if report.status == 200 {

@@ -31,7 +31,7 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 
     let snapshot = format!("/v1/jobs/{job}/snapshots/1");
-    let manifest = app.get(&format!("{snapshot}/manifest.json")).await.expect(200).json();
+    let manifest = app.get(&format!("{snapshot}/exports/manifest")).await.expect(200).json();
     let content = &manifest["content"];
     assert_eq!(content["inputs"]["measurement_sha256"], data);
     assert_eq!(content["inputs"]["measurement_axes"], "frame-row-column");
@@ -44,7 +44,7 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     let expected = [0.02, 0.024, 0.028, 0.032];
     assert!(starts.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{starts:?}");
     assert_eq!(manifest["run"]["job"], job);
-    let job_manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    let job_manifest = app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
     assert_eq!(job_manifest["content"]["snapshots"][0]["summary"], content["summary"]);
     // The tasks are prepare, preview, six tiles, assemble and manifest.
     assert_eq!(job_manifest["run"]["tasks"], 10);
@@ -67,7 +67,7 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
         "{}",
         String::from_utf8_lossy(&line.stderr)
     );
-    let served = app.get(&format!("{snapshot}/frames.npy")).await.expect(200).bytes;
+    let served = app.get(&format!("{snapshot}/exports/npy")).await.expect(200).bytes;
     assert!(served == std::fs::read(path("out/frames.npy")).unwrap(), "bit for bit");
 }
 
@@ -83,6 +83,9 @@ async fn a_measurement_without_light_fails_at_once_with_its_reason() {
     let error = ended["error"].as_str().unwrap();
     assert!(error.contains("snapshot 1") && error.contains("holds no light"), "{error}");
     assert!(!error.contains("attempts"), "a retry is useless: {error}");
+    let problem = &ended["problem"];
+    assert_eq!((&problem["code"], &problem["stage"]), (&json!("task_failed"), &json!("prepare")));
+    assert_eq!((&problem["snapshot"], &problem["tile"]), (&Value::Null, &Value::Null));
 }
 
 /// The metrics pass the linter of Prometheus.

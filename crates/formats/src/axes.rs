@@ -12,6 +12,7 @@ use crate::error::Result;
 )]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
+#[derive(schemars::JsonSchema)]
 pub enum Axes {
     /// \[frame, row, column\].
     FrameRowColumn,

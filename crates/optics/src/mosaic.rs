@@ -31,6 +31,7 @@ pub const MARGIN: usize = 2;
 )]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
+#[derive(schemars::JsonSchema)]
 pub enum Mosaic {
     /// Red and green, then green and blue.
     Rggb,

@@ -38,7 +38,7 @@ impl Client {
     ) -> Result<Fetched> {
         let mut head = self.send(|| self.request(Method::HEAD, href)).await?;
         while head.status() == StatusCode::ACCEPTED {
-            // A worker makes a movie at the first request for it.
+            // A worker is encoding the movie.
             tokio::time::sleep(POLL).await;
             head = self.send(|| self.request(Method::HEAD, href)).await?;
         }

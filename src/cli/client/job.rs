@@ -113,11 +113,11 @@ impl Wanted {
     /// For a file of the whole job, its path below the job's URL and its local name.
     fn job_file(self) -> Option<(&'static str, &'static str)> {
         match self {
-            Self::Manifest => Some(("manifest.json", "manifest.json")),
-            Self::SequenceArray => Some(("sequence/frames.npy", "sequence.npy")),
-            Self::SequenceTiff => Some(("sequence/stack.tif", "sequence.tif")),
-            Self::SequenceMovie => Some(("sequence/movie.mp4", "sequence.mp4")),
-            Self::Archive => Some(("results.zip", "results.zip")),
+            Self::Manifest => Some(("exports/manifest", "manifest.json")),
+            Self::SequenceArray => Some(("exports/npy", "sequence.npy")),
+            Self::SequenceTiff => Some(("exports/tiff", "sequence.tif")),
+            Self::SequenceMovie => Some(("exports/mp4", "sequence.mp4")),
+            Self::Archive => Some(("exports/zip", "results.zip")),
             _ => None,
         }
     }
@@ -153,7 +153,7 @@ impl Job {
 impl Client {
     /// Requests a job. The service answers when the job has ended, at the latest after `wait` seconds.
     pub(in crate::cli) async fn job(&self, id: &str, wait: u32) -> Result<Job> {
-        Job::new(self.get(&format!("/v1/jobs/{id}?wait={wait}")).await?)
+        Job::new(self.get_ended(&format!("/v1/jobs/{id}"), wait).await?)
     }
 
     /// Creates a resource with an idempotency key, and waits until its files are checked. Returns its identifier.
@@ -166,7 +166,7 @@ impl Client {
         let mut resource = self.create(path, body, key).await?;
         let id = id(&resource)?;
         while resource["state"] == "preparing" {
-            resource = self.get(&format!("{path}/{id}?wait=20")).await?;
+            resource = self.get_ended(&format!("{path}/{id}"), 20).await?;
         }
         let problem = &resource["problem"];
         match problem["status"].as_u64().and_then(|status| u16::try_from(status).ok()) {
@@ -194,23 +194,27 @@ impl Client {
                 let Some(href) = &file.href else { continue };
                 if wanted.iter().any(|wanted| wanted.includes(&file.name)) {
                     let path = snapshot_folder.join(relative(&file.name)?);
-                    files.push((href.clone(), path, Some(file.sha256)));
+                    // Relative to the address of the list.
+                    files.push((format!("{base}/snapshots/{href}"), path, Some(file.sha256)));
                 }
             }
             let exports = [
-                (Wanted::StackWithError, "stack.exr?layers=sigma", "stack-sigma.exr"),
-                (Wanted::Tiff, "stack.tif", "stack.tif"),
-                (Wanted::Movie, "movie.mp4", "movie.mp4"),
+                (Wanted::StackWithError, "exr?layers=sigma", "stack-sigma.exr"),
+                (Wanted::Tiff, "tiff", "stack.tif"),
+                (Wanted::Movie, "mp4", "movie.mp4"),
             ];
             for (export, query, name) in exports {
                 if wanted.contains(&export) {
-                    files.push((
-                        format!("{snapshot_url}/{query}"),
-                        snapshot_folder.join(name),
-                        None,
-                    ));
+                    let href = format!("{snapshot_url}/exports/{query}");
+                    files.push((href, snapshot_folder.join(name), None));
                 }
             }
+            if wanted.contains(&Wanted::Movie) {
+                self.create_movie(&base, Some(snapshot)).await?;
+            }
+        }
+        if wanted.contains(&Wanted::SequenceMovie) {
+            self.create_movie(&base, None).await?;
         }
         for (query, name) in wanted.iter().filter_map(|wanted| wanted.job_file()) {
             files.push((format!("{base}/{query}"), folder.join(name), None));
@@ -222,6 +226,12 @@ impl Client {
             bar.finish_and_clear();
         }
         Ok(files.into_iter().map(|(_, path, _)| path).collect())
+    }
+
+    /// Has the service encode a movie of a snapshot of a job, or of all; it may exist already.
+    async fn create_movie(&self, job: &str, snapshot: Option<u32>) -> Result<()> {
+        let body = serde_json::json!({"format": "mp4", "snapshot": snapshot});
+        self.post(&format!("{job}/exports"), &body).await.map(|_| ())
     }
 
     /// Uploads a file, with a progress bar on a terminal.

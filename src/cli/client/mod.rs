@@ -158,6 +158,12 @@ impl Client {
         self.json(|| self.request(reqwest::Method::GET, path)).await
     }
 
+    /// Gets a resource whose work may still run; the service answers at the end of the work, or after `wait` seconds.
+    async fn get_ended(&self, path: &str, wait: u32) -> Result<Value> {
+        let prefer = format!("wait={wait}");
+        self.json(|| self.request(reqwest::Method::GET, path).header("Prefer", &prefer)).await
+    }
+
     pub(super) async fn post(&self, path: &str, body: &Value) -> Result<Value> {
         self.json(|| self.request(reqwest::Method::POST, path).json(body)).await
     }

@@ -74,11 +74,11 @@ impl Client {
         });
         let created = created.await?;
         let url = created.headers().get("location").and_then(|url| url.to_str().ok());
-        // A proxy may put a prefix before the service's path.
-        let path = url.and_then(|url| url.find("/v1/uploads/").map(|at| &url[at..]));
-        let path =
-            path.ok_or_else(|| CliError::Failure("the service's answer names no upload".into()))?;
-        Ok(path.to_owned())
+        // Relative, or below a prefix of a proxy: the identifier is at the end.
+        let id = url.and_then(|url| url.rsplit('/').next()).filter(|id| !id.is_empty());
+        let id =
+            id.ok_or_else(|| CliError::Failure("the service's answer names no upload".into()))?;
+        Ok(format!("/v1/uploads/{id}"))
     }
 
     /// Sends the bytes that the service lacks.

@@ -132,7 +132,7 @@ async fn results_of(client: &Client, job: &str, folder: &Path) -> Result<(Array3
 
 /// Reads the processor seconds of a job from its manifest.
 async fn cpu_seconds(client: &Client, job: &str) -> Result<f64> {
-    let manifest = client.get(&format!("/v1/jobs/{job}/manifest.json")).await?;
+    let manifest = client.get(&format!("/v1/jobs/{job}/exports/manifest")).await?;
     let seconds = manifest["run"]["cpu_seconds"].as_f64();
     seconds.ok_or_else(|| CliError::Failure("the manifest has no cpu_seconds".into()))
 }

@@ -21,17 +21,22 @@ function signedOut(during) {
   if (during === session) dispatchEvent(new Event("signed-out"));
 }
 
+/** URL of the session, whose cookie belongs to the path of this page. */
+function sessionPlace() {
+  return place(`/view/session?path=${new URL(".", document.baseURI).pathname}`);
+}
+
 /** Exchanges a token for a session; throws `Refused` if the token is rejected. */
 export async function signIn(token) {
   const headers = { ...CSRF_HEADERS, Authorization: `Bearer ${token}` };
-  const response = await fetch(place("/v1/session"), { method: "POST", headers });
+  const response = await fetch(sessionPlace(), { method: "POST", headers });
   if (!response.ok) throw await refused(response);
   renew();
 }
 
 /** Ends the session. */
 export async function signOut() {
-  const response = await fetch(place("/v1/session"), { method: "DELETE", headers: CSRF_HEADERS });
+  const response = await fetch(sessionPlace(), { method: "DELETE", headers: CSRF_HEADERS });
   // 401 means that the session has already ended.
   if (!response.ok && response.status !== 401) throw await refused(response);
   renew();
@@ -59,7 +64,7 @@ export async function create(path, body, signal, during = () => {}) {
   let made = await send("POST", path, body);
   while (made.state === "preparing") {
     during(made);
-    made = await get(`${path}/${made.id}?wait=0.7`, signal);
+    made = await get(`${path}/${made.id}`, signal, { Prefer: "wait=0.7" });
   }
   if (made.state !== "failed") return made;
   throw made.problem ? new Refused(made.problem.status, made.problem) : new Error(made.error);
@@ -70,9 +75,9 @@ export const known = new Map();
 const MAX_KNOWN = 60;
 
 /** Gets JSON with `If-None-Match`; returns the same object as before if nothing has changed. */
-export async function get(path, signal) {
+export async function get(path, signal, more = {}) {
   const before = known.get(path);
-  const headers = before ? { "If-None-Match": before.etag } : {};
+  const headers = before ? { ...more, "If-None-Match": before.etag } : more;
   const response = await ask(path, { headers, signal, cache: "no-store" });
   if (response.status === 304 && before) return before.data;
   if (!response.ok) throw await refused(response);

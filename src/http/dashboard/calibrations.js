@@ -37,7 +37,7 @@ function tile(item, signal) {
 export function glance(item, signal) {
   const ready = item.state === "ready";
   return [
-    ready ? h("img", { src: place(`/v1/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
+    ready ? h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
     h("span", { class: "about" }, h("b", null, nameOf(item)),
       ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
       ready && grade(item.id, signal), h("time", { class: "muted", datetime: item.created_at, title: momentInFull(item.created_at) }, moment(item.created_at))),
@@ -144,14 +144,14 @@ class Masks {
 
   source(name) {
     const { levels, tile } = this.spread;
-    return { base: `/v1/calibrations/${this.item.id}/pictures/${name}`, levels, tile, label: this.choice.selectedOptions[0].textContent };
+    return { base: `/view/calibrations/${this.item.id}/pictures/${name}`, levels, tile, label: this.choice.selectedOptions[0].textContent };
   }
 
   /** Loads the range of values; that of the first mask holds for all masks. */
   async show() {
     const one = this.choice.value === "mask";
     this.player.element.hidden = !one;
-    this.spread = await get(`/v1/calibrations/${this.item.id}/pictures/${one ? "mask-1" : this.choice.value}/spread`, this.signal);
+    this.spread = await get(`/view/calibrations/${this.item.id}/pictures/${one ? "mask-1" : this.choice.value}/spread`, this.signal);
     this.contrast.offer(this.spread);
     this.draw();
   }

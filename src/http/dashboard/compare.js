@@ -64,7 +64,7 @@ function truth(jobs, manifests, table, signal) {
 
 async function manifest(job, signal) {
   if (job.state !== "succeeded") return null;
-  return get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/manifest.json`, signal);
+  return get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/exports/manifest`, signal);
 }
 
 const MODES = [["beside", "Side by side"], ["wipe", "Wipe"], ["difference", "Difference"], ["flicker", "Alternate"]];
@@ -121,7 +121,7 @@ class Group {
 
   base(index, frame) {
     const job = this.jobs[index];
-    return `/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/frame-${frame}`;
+    return `/view/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/frame-${frame}`;
   }
 
   source(index, frame) {

@@ -11,7 +11,7 @@ const SVG = "http://www.w3.org/2000/svg";
 export function place(path) {
   if (!path.startsWith("/")) return path;
   const lab = selectedLab();
-  if (!lab || !path.startsWith("/v1/")) return `.${path}`;
+  if (!lab || !/^\/(v1|view)\//.test(path)) return `.${path}`;
   const [, address, fragment] = /^([^#]*)(.*)$/.exec(path);
   return `.${address}${address.includes("?") ? "&" : "?"}lab=${lab}${fragment}`;
 }

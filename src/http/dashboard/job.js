@@ -67,7 +67,7 @@ export async function job(root, [id], signal) {
   const results = async (now) => {
     const written = await showFiles(files, now, snapshot.value(), signal);
     viewer.stand(now, written);
-    const place = `/v1/jobs/${now.id}/snapshots/${snapshot.value()}/manifest.json`;
+    const place = `/v1/jobs/${now.id}/snapshots/${snapshot.value()}/exports/manifest`;
     const manifest = written ? await get(place, signal).catch((error) => isAborted(error) ? Promise.reject(error) : { error }) : null;
     await verdict.show(now, manifest, snapshot.value());
     made.show(now, manifest, place);
@@ -127,21 +127,24 @@ const MIN_MOVIE_SIDE = 16;
 
 /** Shows the downloads of a snapshot, and those of the whole job once it has succeeded; true if the snapshot's files are written. */
 async function showFiles(element, { id, state, shape, snapshots: { count } }, snapshot, signal) {
-  const { ready, files } = await get(`/v1/jobs/${id}/snapshots/${snapshot}`, signal);
-  const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
+  const base = `/v1/jobs/${id}`;
+  const { ready, files } = await get(`${base}/snapshots/${snapshot}`, signal);
+  // The files' own references are relative to the address of the list.
+  const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href && `${base}/snapshots/${file.href}`, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
   const whole = files.filter((file) => !file.name.includes("/")).sort((one, other) => ORDER.indexOf(one.name) - ORDER.indexOf(other.name));
   const single = files.filter((file) => file.name.includes("/"));
   element.hidden = !ready;
   // These files are generated during the download, so their sizes are unknown.
   const made = (href, text) => h("a", { class: "button small", href, download: true }, text);
   const moves = Math.min(shape.height, shape.width) >= MIN_MOVIE_SIDE;
-  const stack = whole.find((file) => file.name === "stack.exr")?.href;
+  const has = (name) => whole.some((file) => file.name === name);
+  const own = `${base}/snapshots/${snapshot}/exports`;
   put(element, h("b", null, "Download"), whole.map((file) => link(file, file.name === "stack.exr")),
-    stack && whole.some((file) => file.name === "error.npy") && made(`${stack}?layers=sigma`, "EXR stack with expected error"),
-    stack && made(stack.replace(/exr$/, "tif"), "TIFF stack"),
-    stack && moves && movieLink(`/v1/jobs/${id}/snapshots/${snapshot}/movie.mp4`, "Movie", signal),
-    stack && moves && count > 1 && state === "succeeded" && movieLink(`/v1/jobs/${id}/sequence/movie.mp4`, "Movie of all snapshots", signal),
-    stack && state === "succeeded" && made(stack.replace(/snapshots\/.*/, "results.zip"), "All files as ZIP"),
+    ready && has("error.npy") && made(`${own}/exr?layers=sigma`, "EXR stack with expected error"),
+    ready && made(`${own}/tiff`, "TIFF stack"),
+    ready && moves && movieLink(base, snapshot, "Movie", signal),
+    ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "Movie of all snapshots", signal),
+    ready && state === "succeeded" && made(`${base}/exports/zip`, "All files as ZIP"),
     h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;
 }

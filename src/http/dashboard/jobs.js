@@ -217,7 +217,7 @@ function thumb(cell, job, before) {
     put(cell, h("span", { class: "blank" }));
     return;
   }
-  const path = `/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/frame-${Math.ceil(job.shape.frames / 2)}?size=128`;
+  const path = `/view/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/frame-${Math.ceil(job.shape.frames / 2)}?size=128`;
   const image = h("img", { src: place(`${path}#${version}`), alt: "", loading: "lazy", decoding: "async", width: 64, height: 46 });
   image.addEventListener("error", () => image.replaceWith(h("span", { class: "blank" })));
   put(cell, image);

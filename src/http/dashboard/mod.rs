@@ -69,10 +69,10 @@ const FILES: &[(&str, &[u8])] = &files![
     "welcome.js",
 ];
 
-/// A file in both of its representations, each with its own strong ETag.
+/// A document in two representations, each with its own strong ETag.
 #[derive(Debug)]
-struct Asset {
-    name: &'static str,
+pub(super) struct Asset {
+    kind: &'static str,
     plain: Representation,
     packed: Representation,
 }
@@ -89,19 +89,53 @@ impl Representation {
     }
 }
 
-static ASSETS: LazyLock<Vec<Asset>> = LazyLock::new(|| FILES.iter().map(asset).collect());
-
-fn asset(&(name, bytes): &(&'static str, &[u8])) -> Asset {
-    let plain = Representation::new(bytes.to_vec());
-    // Writing to memory does not fail. If it did, the file would be sent uncompressed.
-    let packed = pack(bytes).unwrap_or_else(|_| bytes.to_vec());
-    Asset { name, plain, packed: Representation::new(packed) }
-}
+static ASSETS: LazyLock<Vec<(&str, Asset)>> = LazyLock::new(|| {
+    let asset = |&(name, bytes): &(&'static str, &[u8])| {
+        (name, Asset::new(media_type(name), bytes.to_vec()))
+    };
+    FILES.iter().map(asset).collect()
+});
 
 fn pack(bytes: &[u8]) -> std::io::Result<Vec<u8>> {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
     encoder.write_all(bytes)?;
     encoder.finish()
+}
+
+impl Asset {
+    pub(super) fn new(kind: &'static str, bytes: Vec<u8>) -> Self {
+        // Writing to memory does not fail. If it did, the document would be sent uncompressed.
+        let packed = pack(&bytes).unwrap_or_else(|_| bytes.clone());
+        Self { kind, plain: Representation::new(bytes), packed: Representation::new(packed) }
+    }
+
+    /// The representation that the client takes, 304 or 412.
+    pub(super) fn answer(&self, headers: &HeaderMap) -> Result<Response> {
+        let gzip = takes_gzip(headers);
+        let file = if gzip { &self.packed } else { &self.plain };
+        conditional::check_match(headers, &file.etag)?;
+        let known = conditional::is_known(headers, &file.etag);
+        let mut response = match known {
+            true => StatusCode::NOT_MODIFIED.into_response(),
+            false => file.bytes.clone().into_response(),
+        };
+        let fields = response.headers_mut();
+        let mut set = |name: HeaderName, value: &'static str| {
+            fields.insert(name, HeaderValue::from_static(value));
+        };
+        set(header::CONTENT_TYPE, self.kind);
+        // The browser revalidates every file, so it never mixes old and new modules after an update.
+        set(header::CACHE_CONTROL, "no-cache");
+        set(header::VARY, "accept-encoding");
+        set(header::X_CONTENT_TYPE_OPTIONS, "nosniff");
+        if gzip && !known {
+            set(header::CONTENT_ENCODING, "gzip");
+        }
+        if let Ok(etag) = HeaderValue::try_from(&file.etag) {
+            fields.insert(header::ETAG, etag);
+        }
+        Ok(response)
+    }
 }
 
 pub(super) async fn page(headers: HeaderMap) -> Result<Response> {
@@ -113,33 +147,13 @@ pub(super) async fn file(Params(name): Params<String>, headers: HeaderMap) -> Re
 }
 
 fn send(name: &str, headers: &HeaderMap) -> Result<Response> {
-    let asset = ASSETS.iter().find(|asset| asset.name == name).ok_or_else(|| {
+    let asset = ASSETS.iter().find(|(known, _)| *known == name).ok_or_else(|| {
         ApiError::new(Code::NotFound, "the dashboard has no file with this name; open / instead")
     })?;
-    let gzip = takes_gzip(headers);
-    let file = if gzip { &asset.packed } else { &asset.plain };
-    let known = conditional::is_known(headers, &file.etag);
-    let mut response = match known {
-        true => StatusCode::NOT_MODIFIED.into_response(),
-        false => file.bytes.clone().into_response(),
-    };
+    let mut response = asset.1.answer(headers)?;
     let fields = response.headers_mut();
-    let mut set = |name: HeaderName, value: &'static str| {
-        fields.insert(name, HeaderValue::from_static(value));
-    };
-    set(header::CONTENT_TYPE, media_type(name));
-    // The browser revalidates every file, so it never mixes old and new modules after an update.
-    set(header::CACHE_CONTROL, "no-cache");
-    set(header::VARY, "accept-encoding");
-    set(header::CONTENT_SECURITY_POLICY, POLICY);
-    set(header::X_CONTENT_TYPE_OPTIONS, "nosniff");
-    set(header::REFERRER_POLICY, "no-referrer");
-    if gzip && !known {
-        set(header::CONTENT_ENCODING, "gzip");
-    }
-    if let Ok(etag) = HeaderValue::try_from(&file.etag) {
-        fields.insert(header::ETAG, etag);
-    }
+    fields.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY));
+    fields.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     Ok(response)
 }
 
@@ -204,7 +218,7 @@ mod tests {
 
     #[test]
     fn the_compressed_files_stay_below_the_size_limit() {
-        let bytes: usize = ASSETS.iter().map(|asset| asset.packed.bytes.len()).sum();
+        let bytes: usize = ASSETS.iter().map(|(_, asset)| asset.packed.bytes.len()).sum();
         assert!(bytes < 150_000, "{bytes} bytes");
     }
 

@@ -1,7 +1,7 @@
-// Links to movies, which a worker encodes on the first request.
+// Links to movies, which a worker encodes on request.
 
 import { announce, h, say } from "./dom.js";
-import { ask, refused } from "./api.js";
+import { ask, refused, send } from "./api.js";
 
 /** Milliseconds between requests for the state. */
 const POLL_MS = 1000;
@@ -9,15 +9,20 @@ const POLL_MS = 1000;
 /** Links by view and URL, so that a pending link survives when the downloads are redrawn. */
 const links = new WeakMap();
 
-/** A link that requests a movie, shows the progress, and then downloads it. */
-export function movieLink(path, text, signal) {
+/**
+ * A link that creates the movie of a snapshot of the job at `job`, or of all snapshots, shows the progress, and then
+ * downloads it.
+ */
+export function movieLink(job, snapshot, text, signal) {
+  const path = snapshot === null ? `${job}/exports/mp4` : `${job}/snapshots/${snapshot}/exports/mp4`;
+  const create = () => send("POST", `${job}/exports`, { format: "mp4", snapshot });
   const own = links.get(signal) ?? new Map();
   links.set(signal, own);
-  if (!own.has(path)) own.set(path, make(path, text, signal));
+  if (!own.has(path)) own.set(path, make(path, text, create, signal));
   return own.get(path);
 }
 
-function make(path, text, signal) {
+function make(path, text, create, signal) {
   const link = h("a", { class: "button small", href: path, download: true }, text);
   let asked = false;
   let ready = false;
@@ -27,6 +32,7 @@ function make(path, text, signal) {
     if (asked) return;
     asked = true;
     try {
+      await create();
       await wait(path, (progress) => say(link, `${text}: ${progress}`), signal);
       say(link, text);
       // Don't download if the user has moved on to another snapshot.
@@ -35,7 +41,7 @@ function make(path, text, signal) {
     } catch (error) {
       if (!signal.aborted) say(link, `${text}: ${error.message}`);
     }
-    // The next click requests the movie again, because a retried job has lost it.
+    // The next click creates the movie again, because a retried job has lost it.
     asked = ready = false;
   });
   return link;

@@ -18,7 +18,7 @@ export function grade(id, signal) {
   const element = h("span", { class: "grade" }, " ");
   const ask = async () => {
     try {
-      const { grade: found, findings: reasons } = await get(`/v1/calibrations/${id}/report.json`, signal);
+      const { grade: found, findings: reasons } = await get(`/v1/calibrations/${id}/report`, signal);
       element.classList.add(found);
       put(element, found, reasons.length > 0 && h("span", { class: "muted" }, ` ${reasons.length} ${reasons.length === 1 ? "finding" : "findings"}`));
     } catch (error) {
@@ -39,14 +39,14 @@ export function grade(id, signal) {
 export function report(item, signal) {
   const body = h("div", null, h("p", { class: "muted" }, "…"));
   const element = h("section", { class: "card", "aria-label": "Report" },
-    h("h2", { class: "row" }, "Are the masks good?", h("span", { class: "grow" }), h("a", { href: `/v1/calibrations/${item.id}/report.html`, target: "_blank", rel: "noopener" }, "Printable version (new tab)")), body);
+    h("h2", { class: "row" }, "Are the masks good?", h("span", { class: "grow" }), h("a", { href: `/view/calibrations/${item.id}/report.html`, target: "_blank", rel: "noopener" }, "Printable version (new tab)")), body);
   load(item, body, signal);
   return element;
 }
 
 async function load(item, body, signal) {
   try {
-    show(body, await get(`/v1/calibrations/${item.id}/report.json`, signal));
+    show(body, await get(`/v1/calibrations/${item.id}/report`, signal));
   } catch (error) {
     if (signal.aborted) return;
     put(body, h("p", { class: "muted" }, error.message));

@@ -22,7 +22,7 @@ export class TileMap {
 
   async renew(snapshot) {
     this.snapshot = snapshot;
-    const found = await get(`/v1/jobs/${this.job.id}/snapshots/${snapshot}/tiles`, this.signal);
+    const found = await get(`/view/jobs/${this.job.id}/snapshots/${snapshot}/tiles`, this.signal);
     if (found.items !== this.found) {
       this.found = found.items;
       // Show the run that begins last among those that contain the snapshot; the history is from that run.
@@ -48,7 +48,7 @@ export class TileMap {
   }
 
   async history() {
-    const { points } = await get(`/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/tiles/${this.current()}/history`, this.signal);
+    const { points } = await get(`/view/jobs/${this.job.id}/snapshots/${this.snapshot}/tiles/${this.current()}/history`, this.signal);
     if (points === this.points) return;
     this.points = points;
     convergence(this.plot, points);

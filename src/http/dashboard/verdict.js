@@ -30,7 +30,7 @@ export class Verdict {
   async grade() {
     const link = (text) => h("a", { href: `#/calibrations/${this.job.calibration}` }, text);
     try {
-      const { grade } = await get(`/v1/calibrations/${this.job.calibration}/report.json`, this.signal);
+      const { grade } = await get(`/v1/calibrations/${this.job.calibration}/report`, this.signal);
       this.graded = grade;
       if (this.written && !this.truth) this.unmeasured();
       put(this.calibration, "The ", link("calibration"), " is ", h("span", { class: `grade ${grade}` }, grade), ".");

@@ -70,7 +70,7 @@ export class Viewer {
 
   /** URL of the snapshot's images. */
   base() {
-    return `/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/pictures`;
+    return `/view/jobs/${this.job.id}/snapshots/${this.snapshot}/pictures`;
   }
 
   sliceBase() {
@@ -104,7 +104,7 @@ export class Viewer {
     if (this.waiting) this.player.frame = 1;
     this.waiting = false;
     this.player.showPosition();
-    const base = `/v1/measurements/${this.job.measurement}/pictures/snapshot-${snapshot}`;
+    const base = `/view/measurements/${this.job.measurement}/pictures/snapshot-${snapshot}`;
     try {
       const spread = await get(`${base}/spread`, this.signal);
       this.measured = { base, levels: spread.levels, tile: spread.tile, label: `Measurement, snapshot ${snapshot}` };

@@ -7,10 +7,9 @@ use axum::http::{HeaderMap, Method};
 use axum::response::Response;
 
 use super::super::error::Result;
-use super::super::extract::{Caller, Params};
 use super::super::results::{attachment, result_file};
+use super::clip::Clip;
 use super::composed::{Composed, Framing, Part, Piece};
-use engine::job::JobId;
 
 /// 45 stands for version 4.5, the first with files above 4 GiB.
 const VERSION: u16 = 45;
@@ -26,14 +25,9 @@ const END: u32 = 0x0605_4b50;
 const END_64: u32 = 0x0606_4b50;
 const LOCATOR_64: u32 = 0x0706_4b50;
 
-/// `GET /v1/jobs/{job}/results.zip`.
-pub(in crate::http) async fn archive(
-    Caller(app, access): Caller,
-    Params(id): Params<JobId>,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
-    let job = app.store.job(&access.lab, id).await?;
+/// `zip` of a job.
+pub(super) async fn archive(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
+    let Clip { app, job, .. } = clip;
     // The last file that a job makes.
     let (manifest, _) = result_file(&app, &job, None, "manifest.json").await?;
     let mut members = Vec::new();
@@ -44,9 +38,9 @@ pub(in crate::http) async fn archive(
         }
     }
     members.push((manifest.name.clone(), Piece { snapshot: None, file: manifest }));
-    let disposition = attachment(id, None, "results.zip");
+    let disposition = attachment(job.id, None, "results.zip");
     let composed = Composed { parts: parts(members), kind: "application/zip", disposition };
-    composed.send(&app, job, (&method, &headers)).await
+    composed.send(&app, job, request).await
 }
 
 /// A file of the archive and where it begins.

@@ -1,10 +1,10 @@
-//! The frames of a snapshot, or of all snapshots of a job one after the other, as TIFF, array and Zarr:
-//! views onto the raw frames of `frames.npy`.
+//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, array and Zarr: views onto the raw frames
+//! of `frames.npy`.
 
 use axum::body::Bytes;
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, Method, Uri};
+use axum::http::{HeaderMap, Method};
 use axum::response::Response;
 use serde::Deserialize;
 use serde_json::json;
@@ -15,6 +15,7 @@ use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Caller, Params};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, result_file};
+use super::Format;
 use super::composed::{Composed, Part, Piece};
 use engine::job::JobId;
 use engine::pipeline::manifest::CameraRecord;
@@ -23,18 +24,20 @@ use store::Job;
 
 const ARRAY: &str = "frames.npy";
 
-/// The clip that a path is about.
+/// The frames that a path names, and the format in which they are exported.
 pub(in crate::http) struct Clip {
     pub(super) app: App,
     pub(super) job: Job,
     /// None for all snapshots of the job.
     pub(super) snapshot: Option<u32>,
+    pub(super) format: Format,
 }
 
 #[derive(Deserialize)]
 struct Place {
     job: JobId,
     snapshot: Option<u32>,
+    format: Format,
 }
 
 impl FromRequestParts<App> for Clip {
@@ -42,21 +45,18 @@ impl FromRequestParts<App> for Clip {
 
     async fn from_request_parts(parts: &mut Parts, app: &App) -> Result<Self> {
         let Caller(app, access) = Caller::from_request_parts(parts, app).await?;
-        let Params(Place { job, snapshot }) = Params::from_request_parts(parts, &app).await?;
+        let place = Params::from_request_parts(parts, &app).await?;
+        let Params(Place { job, snapshot, format }) = place;
         let job = match snapshot {
             Some(snapshot) => with_snapshot(&app, &access.lab, job, snapshot).await?,
             None => app.store.job(&access.lab, job).await?,
         };
-        Ok(Self { app, job, snapshot })
+        Ok(Self { app, job, snapshot, format })
     }
 }
 
-/// `stack.tif`: a BigTIFF with the descriptions of OME and ImageJ.
-pub(in crate::http) async fn tiff(
-    clip: Clip,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
+/// `tiff`: a BigTIFF with the descriptions of OME and ImageJ.
+pub(super) async fn tiff(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let times = clip.times().await?;
     let name = clip.snapshot.map_or(String::new(), |snapshot| format!(" snapshot {snapshot}"));
     let head = bigtiff::head(&bigtiff::Clip {
@@ -66,22 +66,55 @@ pub(in crate::http) async fn tiff(
         interval_s: times.interval_s,
         times_s: times.starts_s.as_deref(),
     });
-    clip.behind(head, "image/tiff", "stack.tif", (&method, &headers)).await
+    clip.behind(head, "image/tiff", "stack.tif", request).await
 }
 
-/// `frames.npy` of all snapshots.
-pub(in crate::http) async fn array(
-    clip: Clip,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
+/// `npy` of all snapshots.
+pub(super) async fn array(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let head = npy::stack_header(clip.shape(), clip.channels());
-    clip.behind(head, "application/octet-stream", ARRAY, (&method, &headers)).await
+    clip.behind(head, "application/octet-stream", ARRAY, request).await
 }
 
-/// `frames.zarr/zarr.json`: a chunk is a frame.
-pub(in crate::http) async fn zarr(clip: Clip, headers: HeaderMap) -> Result<Response> {
-    // A chunk that is not there is read as zeros: the array is there when all of them are.
+/// `zarr/zarr.json` and `zarr/c/FRAME/0/0`, for colours `zarr/c/FRAME/0/0/0`: a chunk is a frame, counted from 0.
+pub(super) async fn zarr(
+    clip: Clip,
+    path: &str,
+    request: (&Method, &HeaderMap),
+) -> Result<Response> {
+    if path == "zarr.json" {
+        return describe(clip, request.1).await;
+    }
+    let (frames, ..) = clip.shape();
+    let end = if clip.channels() == Channels::Rgb { "/0/0/0" } else { "/0/0" };
+    let number = path.strip_prefix("c/").and_then(|rest| rest.strip_suffix(end));
+    let frame = number.and_then(|text| plain(text)).filter(|frame| *frame < frames);
+    let frame = frame.ok_or_else(|| {
+        let detail =
+            format!("the array has zarr.json and the chunks c/0{end} to c/{}{end}", frames - 1);
+        ApiError::new(Code::NotFound, detail)
+    })?;
+    let each = clip.job.spec.shape.frames;
+    let first = clip.snapshot.unwrap_or(clip.job.spec.snapshots.first);
+    let snapshot = first + u32::try_from(frame / each).unwrap_or(u32::MAX);
+    let piece = clip.piece(snapshot).await?;
+    let bytes = clip.frame_bytes();
+    let start = clip.start(&piece)? + (frame % each) as u64 * bytes;
+    let composed = Composed {
+        parts: vec![Part::File { piece, start, length: bytes }],
+        kind: "application/octet-stream",
+        disposition: "inline".into(),
+    };
+    composed.send(&clip.app, clip.job, request).await
+}
+
+/// A number in the one form in which it is written.
+pub(super) fn plain(text: &str) -> Option<usize> {
+    text.parse().ok().filter(|number: &usize| number.to_string() == text)
+}
+
+/// `zarr.json`.
+async fn describe(clip: Clip, headers: &HeaderMap) -> Result<Response> {
+    // A missing chunk is read as zeros, so the array is announced once all chunks exist.
     clip.pieces().await?;
     let (frames, height, width) = clip.shape();
     let times = clip.times().await?;
@@ -110,46 +143,7 @@ pub(in crate::http) async fn zarr(clip: Clip, headers: HeaderMap) -> Result<Resp
             "frame_times_s": times.starts_s,
         },
     });
-    conditional::json(&array, &headers)
-}
-
-#[derive(Deserialize)]
-pub(in crate::http) struct Chunk {
-    frame: usize,
-}
-
-/// `frames.zarr/c/{frame}/0/0`, or `frames.zarr/c/{frame}/0/0/0` of colours: the samples of a frame, counted from
-/// 0.
-pub(in crate::http) async fn chunk(
-    clip: Clip,
-    Params(Chunk { frame }): Params<Chunk>,
-    uri: Uri,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
-    let each = clip.job.spec.shape.frames;
-    let frames = clip.shape().0;
-    // A chunk has as many numbers as the array has axes.
-    let axes = uri.path().rsplit('/').take_while(|part| *part != "c").count();
-    if axes != if clip.channels() == Channels::Rgb { 4 } else { 3 } {
-        let detail = "the array has other axes: zarr.json says which";
-        return Err(ApiError::new(Code::NotFound, detail));
-    }
-    if frame >= frames {
-        let detail = format!("the array has {frames} frames, counted from 0");
-        return Err(ApiError::new(Code::NotFound, detail));
-    }
-    let first = clip.snapshot.unwrap_or(clip.job.spec.snapshots.first);
-    let snapshot = first + u32::try_from(frame / each).unwrap_or(u32::MAX);
-    let piece = clip.piece(snapshot).await?;
-    let bytes = clip.frame_bytes();
-    let start = clip.start(&piece)? + (frame % each) as u64 * bytes;
-    let composed = Composed {
-        parts: vec![Part::File { piece, start, length: bytes }],
-        kind: "application/octet-stream",
-        disposition: "inline".into(),
-    };
-    composed.send(&clip.app, clip.job, (&method, &headers)).await
+    conditional::json(&array, headers)
 }
 
 /// When frames were taken, as far as it is known.

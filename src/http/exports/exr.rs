@@ -1,4 +1,4 @@
-//! `stack.exr`: as it is stored, or with the expected error as a layer of each part.
+//! The stack of frames as EXR, with the expected error as a layer of each part.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -7,11 +7,9 @@ use std::sync::Arc;
 use axum::body::Bytes;
 use axum::http::{HeaderMap, Method};
 use axum::response::Response;
-use serde::Deserialize;
 
 use super::super::error::{ApiError, Result};
-use super::super::extract::QueryOf;
-use super::super::results::{attachment, media_type, result_file, send};
+use super::super::results::{attachment, media_type, result_file};
 use super::clip::{Clip, behind_header};
 use super::composed::{Composed, Part, Piece};
 use super::lines::{Lines, Make};
@@ -21,40 +19,16 @@ use formats::exr::{Layered, SIGMA};
 
 const STACK: &str = "stack.exr";
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(in crate::http) struct StackQuery {
-    layers: Option<Layer>,
-}
-
-/// What parts can have beside their frame.
-#[derive(Debug, Deserialize)]
-#[serde(rename_all = "lowercase")]
-enum Layer {
-    Sigma,
-}
-
-/// `GET /v1/jobs/{job}/snapshots/{snapshot}/stack.exr`.
-pub(in crate::http) async fn exr(
-    clip: Clip,
-    QueryOf(query): QueryOf<StackQuery>,
-    method: Method,
-    headers: HeaderMap,
-) -> Result<Response> {
-    let request = (&method, &headers);
-    match query.layers {
-        None => send(&clip.app, &clip.job, clip.snapshot, STACK, request).await,
-        Some(Layer::Sigma) => {
-            let parts = with_sigma(&clip).await?;
-            let disposition = attachment(clip.job.id, clip.snapshot, "stack-sigma.exr");
-            let composed = Composed { parts, kind: media_type(STACK), disposition };
-            composed.send(&clip.app, clip.job, request).await
-        }
-    }
+/// `exr?layers=sigma`.
+pub(super) async fn with_sigma(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
+    let parts = parts(&clip).await?;
+    let disposition = attachment(clip.job.id, clip.snapshot, "stack-sigma.exr");
+    let composed = Composed { parts, kind: media_type(STACK), disposition };
+    composed.send(&clip.app, clip.job, request).await
 }
 
 /// The stored stack, each line with the expected error of its pixels.
-async fn with_sigma(clip: &Clip) -> Result<Vec<Part>> {
+async fn parts(clip: &Clip) -> Result<Vec<Part>> {
     let snapshot = clip.snapshot;
     let (file, _) = result_file(&clip.app, &clip.job, snapshot, "error.npy").await?;
     let errors = Piece { snapshot, file };

@@ -1,36 +1,115 @@
-//! The frames of a snapshot, or of all snapshots of a job one after the other, as a movie. It takes long to make, so
-//! a worker makes it when it is first asked for.
+//! The frames of a snapshot, or of all snapshots of a job in order, as a movie. Encoding takes long, so a worker does it
+//! when a request creates the movie.
 
 use axum::Json;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::super::download::Download;
 use super::super::error::{ApiError, Code, Result};
+use super::super::extract::{Body, Caller, Params};
 use super::super::results::{file_name, media_type};
+use super::Format;
 use super::clip::Clip;
-use engine::job::MIN_MOVIE_SIDE;
+use engine::job::{JobId, MIN_MOVIE_SIDE};
 use store::{Movie, StoreError};
 
 const NAME: &str = "movie.mp4";
 /// Seconds after which to ask again.
 const AGAIN: HeaderValue = HeaderValue::from_static("1");
 
-/// A movie that is not there yet.
-#[derive(Debug, Serialize)]
-struct MovieBody {
-    /// `waiting` until a worker has nothing else to do, then `running`.
-    state: &'static str,
+/// The body of `POST /v1/jobs/{job}/exports`.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+pub(in crate::http) struct ExportRequest {
+    format: CreatedFormat,
+    /// The snapshot; by default all snapshots of the job, in order.
+    snapshot: Option<u32>,
+}
+
+/// Formats that a worker makes on request. The service composes all others while a client reads them.
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
+enum CreatedFormat {
+    Mp4,
+}
+
+/// An export that a worker makes.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Export")]
+pub(in crate::http) struct ExportBody {
+    state: ExportState,
+    /// Share of the work that is done, in percent.
     percent: f64,
 }
 
-/// `movie.mp4`: AV1, at ten frames a second.
-pub(in crate::http) async fn movie(
-    clip: Clip,
-    method: Method,
-    headers: HeaderMap,
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
+enum ExportState {
+    /// No worker is free yet.
+    Waiting,
+    Running,
+    Ready,
+}
+
+/// `POST /v1/jobs/{job}/exports`: has a worker encode a movie, unless it exists.
+pub(in crate::http) async fn create(
+    Caller(app, access): Caller,
+    Params(id): Params<JobId>,
+    Body(ExportRequest { format: CreatedFormat::Mp4, snapshot }): Body<ExportRequest>,
 ) -> Result<Response> {
+    let job = app.store.job(&access.lab, id).await?;
+    if let Some(missing) = snapshot.filter(|snapshot| !job.spec.snapshots.contains(*snapshot)) {
+        return Err(ApiError::field("/snapshot", format!("the job has no snapshot {missing}")));
+    }
+    let base = snapshot.map_or(String::new(), |snapshot| format!("/snapshots/{snapshot}"));
+    let place = format!("/v1/jobs/{id}{base}/exports/mp4");
+    let clip = Clip { app, job, snapshot, format: Format::Mp4 };
+    check(&clip).await?;
+    let (status, body) = match clip.app.store.create_movie(&clip.job, snapshot).await? {
+        Movie::Ready { .. } => {
+            (StatusCode::OK, ExportBody { state: ExportState::Ready, percent: 100.0 })
+        }
+        Movie::Asked(fraction) => (StatusCode::ACCEPTED, pending(fraction)),
+        Movie::Failed(reason) => return Err(failed(&reason)),
+    };
+    Ok((status, [(header::LOCATION, place)], [(header::RETRY_AFTER, AGAIN)], Json(body))
+        .into_response())
+}
+
+/// `mp4`: AV1, at ten frames per second.
+pub(super) async fn movie(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
+    check(&clip).await?;
+    match clip.app.store.movie(&clip.job, clip.snapshot).await? {
+        Some(Movie::Ready { sha256, size }) => {
+            let file = match clip.app.store.open_blob(sha256).await {
+                Err(StoreError::Damaged { .. }) => return Err(missing()),
+                file => file?,
+            };
+            let name = file_name(clip.job.id, clip.snapshot, NAME);
+            let disposition = format!("inline; {name}");
+            let kind = media_type(NAME);
+            let download = Download { sha256, size, kind, disposition, in_parts: true };
+            download.send(async { Ok(file) }, request).await
+        }
+        Some(Movie::Asked(fraction)) => {
+            let fields = [
+                (header::RETRY_AFTER, AGAIN),
+                (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
+            ];
+            Ok((StatusCode::ACCEPTED, fields, Json(pending(fraction))).into_response())
+        }
+        Some(Movie::Failed(reason)) => Err(failed(&reason)),
+        None => Err(missing()),
+    }
+}
+
+/// Refuses frames that have no movie, or that are not there.
+async fn check(clip: &Clip) -> Result<()> {
     if !clip.job.spec.has_movie() {
         let detail = format!(
             "there is no movie of frames of {}x{}: it would have a side below {MIN_MOVIE_SIDE} pixels",
@@ -38,37 +117,22 @@ pub(in crate::http) async fn movie(
         );
         return Err(ApiError::new(Code::NotFound, detail));
     }
-    // Of what is not there no movie can be made.
     clip.pieces().await?;
-    loop {
-        match clip.app.store.movie(&clip.job, clip.snapshot).await? {
-            Movie::Ready { sha256, size } => {
-                let file = match clip.app.store.open_blob(sha256).await {
-                    // Known to be damaged by now, it is made again.
-                    Err(StoreError::Damaged { .. }) => continue,
-                    file => file?,
-                };
-                let name = file_name(clip.job.id, clip.snapshot, NAME);
-                let disposition = format!("inline; {name}");
-                let kind = media_type(NAME);
-                let download = Download { sha256, size, kind, disposition, in_parts: true };
-                return download.send(async { Ok(file) }, (&method, &headers)).await;
-            }
-            Movie::Asked(fraction) => return Ok(asked(fraction)),
-            Movie::Failed(reason) => {
-                let detail = format!("{reason}. Asked for again, it is tried again");
-                return Err(ApiError::new(Code::MovieFailed, detail));
-            }
-        }
-    }
+    Ok(())
 }
 
-fn asked(fraction: Option<f64>) -> Response {
-    let state = if fraction.is_some() { "running" } else { "waiting" };
-    let percent = (fraction.unwrap_or(0.0) * 1000.0).round() / 10.0;
-    let fields = [
-        (header::RETRY_AFTER, AGAIN),
-        (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
-    ];
-    (StatusCode::ACCEPTED, fields, Json(MovieBody { state, percent })).into_response()
+fn pending(fraction: Option<f64>) -> ExportBody {
+    let state = if fraction.is_some() { ExportState::Running } else { ExportState::Waiting };
+    ExportBody { state, percent: (fraction.unwrap_or(0.0) * 1000.0).round() / 10.0 }
+}
+
+fn missing() -> ApiError {
+    let detail = "there is no movie yet: POST {\"format\": \"mp4\"} to exports of the job, with the snapshot, \
+                  creates it";
+    ApiError::new(Code::NotFound, detail)
+}
+
+fn failed(reason: &str) -> ApiError {
+    let detail = format!("{reason}. POST to exports of the job tries again");
+    ApiError::new(Code::MovieFailed, detail)
 }

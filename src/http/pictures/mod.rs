@@ -40,17 +40,21 @@ pub(super) struct TileQuery {
     white: f32,
 }
 
-/// What a viewer must know of a picture before it asks for tiles.
-#[derive(Debug, Serialize)]
-struct SpreadBody {
+/// Size of a picture and range of its values, from which a viewer chooses tiles and contrast.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Spread")]
+pub(in crate::http) struct SpreadBody {
     height: usize,
     width: usize,
+    /// Side of a tile in pixels.
     tile: usize,
-    /// The last level, at which one tile holds all.
+    /// The last level, at which one tile shows the whole picture.
     levels: u32,
     minimum: f32,
     maximum: f32,
+    /// Half a percent of the pixels lie below.
     low: f32,
+    /// Half a percent of the pixels lie above.
     high: f32,
 }
 

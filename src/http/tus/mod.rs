@@ -6,9 +6,8 @@
 mod append;
 pub mod headers;
 
-use axum::Json;
 use axum::body::Body;
-use axum::extract::{Request, State};
+use axum::extract::{OriginalUri, Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -16,9 +15,12 @@ use serde::{Deserialize, Serialize};
 
 use super::access::Access;
 use super::app::App;
+use super::conditional;
+use super::context::RequestContext;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, request_key};
-use super::page::{Limit, PageBody};
+use super::listen::Cut;
+use super::page::{Cursor, Limit, PageBody};
 use engine::job::{Lab, PartialId, Sha256, Timestamp};
 use store::{FIRST_RESERVE, FoundPartial, Inserted, Made, NewPartial, Partial, PartialFile};
 
@@ -29,6 +31,24 @@ const METADATA: HeaderName = HeaderName::from_static("upload-metadata");
 const CHECKSUM: HeaderName = HeaderName::from_static("upload-checksum");
 const EXPIRES: HeaderName = HeaderName::from_static("upload-expires");
 const VERSION: HeaderValue = HeaderValue::from_static("1.0.0");
+
+/// Rewrites a request by the rules of tus. `X-HTTP-Method-Override` replaces the method, for clients that can send only
+/// POST. A trailing slash of the address of all uploads is ignored.
+pub(super) fn rewrite(mut request: Request) -> Request {
+    let path = request.uri().path();
+    if path == "/v1/uploads/" {
+        let query = request.uri().query().map_or(String::new(), |query| format!("?{query}"));
+        if let Ok(uri) = format!("/v1/uploads{query}").parse() {
+            let original = std::mem::replace(request.uri_mut(), uri);
+            request.extensions_mut().insert(OriginalUri(original));
+        }
+    } else if path.starts_with("/v1/uploads/") && *request.method() == Method::POST {
+        let meant = request.headers().get("x-http-method-override");
+        let meant = meant.and_then(|name| Method::from_bytes(name.as_bytes()).ok());
+        *request.method_mut() = meant.unwrap_or(Method::POST);
+    }
+    request
+}
 
 /// Speaks version 1.0.0 alone, and says so in every answer.
 pub(super) async fn version(request: Request, next: Next) -> Response {
@@ -52,36 +72,50 @@ pub(super) async fn version(request: Request, next: Next) -> Response {
 pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
-    cursor: Option<PartialId>,
+    cursor: Option<Cursor<PartialId>>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Upload")]
 pub(super) struct UploadBody {
     id: PartialId,
-    /// Bytes of the whole file, and those that have come.
+    /// Bytes of the whole file.
     length: u64,
+    /// Bytes received so far.
     received: u64,
+    /// `Upload-Metadata` as the client sent it.
     metadata: String,
-    /// The blob that it has become.
+    /// The blob that the upload has become; null until it is complete.
     sha256: Option<Sha256>,
     expires_at: Timestamp,
+}
+
+impl From<Partial> for UploadBody {
+    fn from(upload: Partial) -> Self {
+        Self {
+            id: upload.id,
+            length: upload.facts.length,
+            received: upload.received,
+            metadata: upload.facts.metadata,
+            sha256: upload.result,
+            expires_at: upload.expires_at,
+        }
+    }
+}
+
+async fn current(app: &App, lab: &Lab, id: PartialId) -> Result<UploadBody> {
+    Ok(app.store.partial(lab, id).await?.into())
 }
 
 /// `GET /v1/uploads`: those that have begun, newest first.
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
-) -> Result<Json<PageBody<UploadBody>>> {
-    let page = app.store.partials(&access.lab, query.cursor, query.limit.get()).await?;
-    let show = |upload: Partial| UploadBody {
-        id: upload.id,
-        length: upload.facts.length,
-        received: upload.received,
-        metadata: upload.facts.metadata,
-        sha256: upload.result,
-        expires_at: upload.expires_at,
-    };
-    Ok(Json(PageBody::new(page, |upload| upload.id.to_string(), show)))
+    request: RequestContext,
+) -> Result<Response> {
+    let after = query.cursor.map(|Cursor(id)| id);
+    let page = app.store.partials(&access.lab, after, query.limit.get()).await?;
+    PageBody::new(page, |upload: &Partial| upload.id.to_string(), UploadBody::from).answer(&request)
 }
 
 /// `OPTIONS /v1/uploads`: what this service can do.
@@ -97,6 +131,10 @@ pub(super) async fn options(State(app): State<App>) -> Response {
 
 /// `POST /v1/uploads`: begins an upload.
 pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
+    if headers.contains_key("upload-concat") {
+        let detail = "uploads are not concatenated: send the file as one upload (parallelUploads: 1 in tus-js-client)";
+        return Err(malformed(detail.into()));
+    }
     let length = number(&headers, &LENGTH)?;
     if length == 0 {
         return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
@@ -160,7 +198,8 @@ pub(super) async fn show(
     let about = [(LENGTH, length), (METADATA, upload.facts.metadata.clone())];
     let about = about.into_iter().filter(|(_, value)| !value.is_empty());
     let cache = [(header::CACHE_CONTROL, "no-store")];
-    Ok((cache, state(&upload), axum::response::AppendHeaders(about.collect::<Vec<_>>()))
+    let etag = [(header::ETAG, conditional::etag_of(&UploadBody::from(upload.clone()))?)];
+    Ok((cache, etag, state(&upload), axum::response::AppendHeaders(about.collect::<Vec<_>>()))
         .into_response())
 }
 
@@ -169,14 +208,25 @@ pub(super) async fn patch(
     Caller(app, access): Caller,
     Params(id): Params<PartialId>,
     headers: HeaderMap,
+    request: RequestContext,
     body: Body,
 ) -> Result<Response> {
+    drop(request.precondition(&app, current(&app, &access.lab, id)).await?);
     let permit = app.admission.place(&access.lab)?;
     let upload = to_the_end(async move {
         let _permit = permit;
         piece(&app, &access, id, &headers, body).await
     });
-    Ok((StatusCode::NO_CONTENT, state(&upload.await?)).into_response())
+    match upload.await {
+        Ok(upload) => Ok((StatusCode::NO_CONTENT, state(&upload)).into_response()),
+        // Clients of tus go on after a cut, and give up after 408.
+        Err(error) if error.code() == Code::UploadStalled => {
+            let mut response = error.into_response();
+            response.extensions_mut().insert(Cut);
+            Ok(response)
+        }
+        Err(error) => Err(error),
+    }
 }
 
 /// A task of its own: what has come is recorded also when the connection, and with it the request, is
@@ -237,9 +287,12 @@ async fn finish(app: &App, file: PartialFile) -> Result<Partial> {
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<PartialId>,
+    request: RequestContext,
 ) -> Result<StatusCode> {
+    let _guard = request.precondition(&app, current(&app, &access.lab, id)).await?;
     app.store.partial(&access.lab, id).await?;
-    let deleted = to_the_end(async move { Ok(app.store.delete_partial(id).await?) });
+    let store = app.store.clone();
+    let deleted = to_the_end(async move { Ok(store.delete_partial(id).await?) });
     if deleted.await? { Ok(StatusCode::NO_CONTENT) } else { Err(busy()) }
 }
 

@@ -492,7 +492,7 @@ async fn residuals_and_hashes(
     assert_eq!(done["state"], "succeeded", "{done:#}");
     let mut residuals = Vec::new();
     for snapshot in 0..snapshots {
-        let tiles = app.get(&format!("/v1/jobs/{id}/snapshots/{snapshot}/tiles")).await;
+        let tiles = app.get(&format!("/view/jobs/{id}/snapshots/{snapshot}/tiles")).await;
         let tiles = tiles.expect(200).json()["items"].as_array().unwrap().clone();
         residuals.extend(tiles.iter().map(|tile| tile["residual"].clone()));
     }

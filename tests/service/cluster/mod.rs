@@ -120,7 +120,7 @@ async fn a_job_on_remote_workers_gives_the_same_bytes() {
     let done = app.ended(&id).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
     assert_eq!(results(&app, &id).await, *expected);
-    let history = app.get(&format!("/v1/jobs/{id}/snapshots/0/tiles/0/history")).await;
+    let history = app.get(&format!("/view/jobs/{id}/snapshots/0/tiles/0/history")).await;
     assert!(!history.expect(200).json()["points"].as_array().unwrap().is_empty());
     assert_eq!(figure(&app, "sci_recon_cluster_refused_total").await, 0.0);
     assert_eq!(figure(&app, "sci_recon_cluster_redelivered_total").await, 0.0);

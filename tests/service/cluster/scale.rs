@@ -423,7 +423,7 @@ async fn cost(app: &TestApp, nats: &Nats, workers: &[RemoteWorker], body: &Value
         }
     }
     let after = spent();
-    let manifest = app.get(&format!("/v1/jobs/{job}/snapshots/0/manifest.json")).await.json();
+    let manifest = app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/manifest")).await.json();
     let tiles = manifest["run"]["cpu_seconds"].as_f64().unwrap_or_else(|| panic!("{manifest:#}"));
     [after.0 - before.0, after.1 - before.1, after.2 - before.2, tiles, home]
 }

@@ -298,6 +298,11 @@ class Client:
         record: Record = transfer.send(self.http, "GET", path, params=parameters).json()
         return record
 
+    def _get_ended(self, path: str, wait: float) -> Record:
+        """A record, answered when its work has ended, or after `wait` seconds."""
+        record: Record = transfer.send(self.http, "GET", path, headers={"Prefer": f"wait={wait}"}).json()
+        return record
+
     def _pages(self, path: str, filters: Mapping[str, str]) -> Iterator[Record]:
         parameters = dict(filters)
         while True:
@@ -334,7 +339,7 @@ class Entity:
         with self.client._bar(f"{self.__class__.__name__.lower()} {self.id}", "%") as bar:
             while self.record.get("state") == "preparing":
                 bar(int(self.record.get("percent", 0)), 100)
-                self.record = self.client._get(f"/v1/{collection}/{self.id}", wait=2)
+                self.record = self.client._get_ended(f"/v1/{collection}/{self.id}", 2)
         if problem := self.record.get("problem"):
             raise ApiError(problem["status"], problem)
         if self.record.get("state") == "failed":
@@ -368,7 +373,7 @@ class Calibration(Entity):
 
     def report(self) -> Record:
         """What is known of the masks: a grade, findings, and what to do."""
-        return self.client._get(f"/v1/calibrations/{self.id}/report.json")
+        return self.client._get(f"/v1/calibrations/{self.id}/report")
 
 
 @dataclass
@@ -421,7 +426,7 @@ class Job(Entity):
                 # Answered when the job has ended; at once where too many of a lab wait.
                 longest = 2.0 if self.client.progress else 20.0
                 wait = longest if end is None else max(0.0, min(longest, end - asked))
-                self.record = self.client._get(f"/v1/jobs/{self.id}", wait=round(wait, 3))
+                self.record = self.client._get_ended(f"/v1/jobs/{self.id}", round(wait, 3))
                 if time.monotonic() - asked < 0.2:
                     transfer.pause(2)
             bar(100, 100)
@@ -518,15 +523,17 @@ class Result:
         path = self.folder / f"snapshot_{index:04d}" / name
         if not (path.is_file() and transfer.sha256(path) == file["sha256"]):
             with self.job.client._bar(f"download {name}") as bar:
-                transfer.download(self.job.client.http, file["href"], path, file["sha256"], bar)
+                # Relative to the address of the list.
+                href = f"/v1/jobs/{self.job.id}/snapshots/{file['href']}"
+                transfer.download(self.job.client.http, href, path, file["sha256"], bar)
         return path
 
     def movie(self, snapshot: int | None = None) -> Path:
-        """Fetches the movie (AV1 in MP4, ten frames a second) of a snapshot, or of all of them one after the other. The
-        service makes it when it is first asked for."""
+        """Creates the movie (AV1 in MP4, ten frames per second) of a snapshot, or of all in order, and fetches it."""
         http = self.job.client.http
-        part = "sequence" if snapshot is None else f"snapshots/{snapshot}"
-        href = f"/v1/jobs/{self.job.id}/{part}/movie.mp4"
+        base = f"/v1/jobs/{self.job.id}"
+        transfer.send(http, "POST", f"{base}/exports", json={"format": "mp4", "snapshot": snapshot})
+        href = f"{base}/exports/mp4" if snapshot is None else f"{base}/snapshots/{snapshot}/exports/mp4"
         while (answer := transfer.send(http, "HEAD", href)).status_code == 202:
             transfer.pause(0, answer.headers.get("Retry-After"))
         sha256 = answer.headers["ETag"].strip('"')
@@ -539,7 +546,7 @@ class Result:
     @property
     def manifest(self) -> Record:
         """What went into the job and what came of it."""
-        return self.job.client._get(f"/v1/jobs/{self.job.id}/manifest.json")
+        return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
 
 
 def describe(finding: Record) -> str:

@@ -14,6 +14,8 @@ use super::text::{InvalidText, Sha256};
 /// A lab (tenant). Data belong to one lab and are invisible to all others.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, derive_more::Display)]
 #[serde(transparent)]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "LabName")]
 pub struct Lab(String);
 
 impl Lab {
@@ -59,6 +61,7 @@ impl FromStr for Lab {
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
 #[strum(parse_err_ty = InvalidText, parse_err_fn = unknown_role)]
+#[derive(schemars::JsonSchema)]
 pub enum Role {
     /// View the lab's data and download results.
     Read,

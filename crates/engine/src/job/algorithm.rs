@@ -13,6 +13,7 @@ use reconstruction::schedule::Schedule;
 )]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case", const_into_str)]
+#[derive(schemars::JsonSchema)]
 pub enum Algorithm {
     GapTv,
     /// GAP with total variation in space, and in time where the pilot finds a gain.

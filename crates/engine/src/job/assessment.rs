@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::report::{Finding, Grade};
 
 /// The predicted quality of the frames of a snapshot or a job.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Assessment {
     pub grade: Grade,
     /// Predicted PSNR in dB relative to the full scale of the measurement, mean over the frames. Values above 40 dB are

@@ -23,21 +23,25 @@ pub fn planned_seconds(samples: u64, frames: usize, pixels: usize) -> f64 {
 /// The captures of a calibration, as uploads or as paths. Each file holds one frame or several repeats.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "Captures")]
 pub struct Captures<T = Sha256> {
     /// For each pattern, in order: captures of the white board with the lithography mask in place.
+    #[schemars(length(min = 1, max = 64))]
     pub masks: Vec<Vec<T>>,
     /// LCoS all white, lithography mask removed.
     pub white: Vec<T>,
     /// LCoS all black, lithography mask removed.
     pub black: Vec<T>,
     /// LCoS all black, lithography mask in place. If empty, `black` is used instead (Eq. 7 of the paper).
-    #[serde(default = "Vec::new")]
+    #[serde(default = "Vec::<T>::new")]
     pub black_with_mask: Vec<T>,
     /// The intended aperture patterns, one frame each, for a check of the order.
-    #[serde(default = "Option::default")]
+    #[serde(default = "Option::<T>::default")]
     pub patterns: Option<T>,
     /// Stored value from which a pixel is saturated; by default the largest of the data type.
     #[serde(default)]
+    #[schemars(range(min = 1))]
     pub saturation: Option<u32>,
 }
 

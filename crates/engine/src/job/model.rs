@@ -6,7 +6,7 @@ use super::{Algorithm, CalibrationId, InvalidField, Label, ModelId, SceneShape, 
 use reconstruction::schedule::Schedule;
 
 /// An input or output tensor of a network.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ModelTensor {
     pub name: String,
     /// Length of each axis; null for a variable one.
@@ -14,7 +14,7 @@ pub struct ModelTensor {
 }
 
 /// Cost of a trial run on zeros, for planning jobs.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ModelTrial {
     pub height: usize,
     pub width: usize,
@@ -25,7 +25,7 @@ pub struct ModelTrial {
 }
 
 /// The result of the check of a network.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ModelFacts {
     pub inputs: Vec<ModelTensor>,
     pub outputs: Vec<ModelTensor>,

@@ -1,15 +1,16 @@
 //! Findings and calibration reports in the form that is stored and shown.
 
 use serde::{Deserialize, Serialize};
-use strum::IntoStaticStr;
+use strum::{IntoStaticStr, VariantArray};
 
 use optics::{CaptureFigures, MaskFigures, PatternFigures};
 pub use optics::{FindingCode, Severity};
 
 /// A problem that a check has found. [`FindingCode`] is the registry of all codes.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Finding {
     /// Stable identifier; a text, because stored findings may have codes of other versions.
+    #[schemars(extend("x-extensible-enum" = codes()))]
     pub code: String,
     pub severity: Severity,
     /// The observation with its numbers, for people.
@@ -43,12 +44,18 @@ impl From<optics::Finding> for Finding {
     }
 }
 
+/// Names of all findings.
+fn codes() -> Vec<&'static str> {
+    optics::FindingCode::VARIANTS.iter().map(|code| code.as_str()).collect()
+}
+
 /// The grade of a calibration or a result.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, IntoStaticStr,
 )]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
+#[derive(schemars::JsonSchema)]
 pub enum Grade {
     /// No findings.
     Good,
@@ -70,7 +77,7 @@ impl Grade {
 }
 
 /// The report on a calibration.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct CalibrationReport {
     /// Name and version of this schema.
     pub schema: String,
@@ -87,7 +94,7 @@ pub struct CalibrationReport {
 }
 
 /// Statistics of masks on \[0,1\].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct MaskReport {
     pub mean: f64,
     /// Standard deviation over the masks, averaged over all pixels.
@@ -114,7 +121,7 @@ pub struct MaskReport {
 }
 
 /// Statistics of captures. Levels are stored values.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct CaptureReport {
     /// Mean share of the light of the open aperture that the masks transmit.
     pub light_throughput: f64,
@@ -142,7 +149,7 @@ pub struct CaptureReport {
 }
 
 /// Statistics of the captures of one pattern.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct PatternReport {
     /// Mean share of the light of the white image.
     pub light: f64,

@@ -1,5 +1,8 @@
 //! Job requests as users write them, and job specifications after all checks.
 
+use std::borrow::Cow;
+
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 use super::algorithm::Algorithm;
@@ -38,6 +41,27 @@ pub enum SnapshotSelection {
     Range(u32, u32),
 }
 
+impl JsonSchema for SnapshotSelection {
+    fn schema_name() -> Cow<'static, str> {
+        "Selection".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        let index = json_schema!({
+            "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX,
+        });
+        json_schema!({
+            "description": "All snapshots, one by its index from 0, or [first, last] with both ends included.",
+            "default": "all",
+            "anyOf": [
+                { "type": "string", "enum": ["all"] },
+                index,
+                { "type": "array", "minItems": 2, "maxItems": 2, "items": index },
+            ],
+        })
+    }
+}
+
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
 enum SelectionJson {
@@ -74,6 +98,7 @@ impl From<SnapshotSelection> for SelectionJson {
 /// The body of `POST /v1/jobs`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
 pub struct JobRequest {
     pub measurement: MeasurementId,
     /// If stated, it must be the calibration of the measurement. It is a check, not a choice.
@@ -86,17 +111,18 @@ pub struct JobRequest {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sequence: Option<Sequence>,
     pub algorithm: Algorithm,
-    /// The network of [`Algorithm::Learned`].
+    /// The model of algorithm `learned`, registered for the calibration of the measurement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub model: Option<ModelId>,
     /// The schedule; by default that of the algorithm.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub schedule: Option<Schedule>,
-    /// The tiles; by default [`Algorithm::default_tile`], or the whole picture for a network of fixed size.
+    /// The tiles; by default those of the algorithm, or the whole picture for a network of fixed size.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
-    /// From -100 to 100. Jobs of higher priority are served first.
+    /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
+    #[schemars(range(min = -100, max = 100))]
     pub priority: i32,
     /// A name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]

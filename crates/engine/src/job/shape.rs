@@ -13,7 +13,7 @@ use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::TilePlan;
 
 /// A range of consecutive snapshots of a measurement.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct SnapshotRange {
     /// Index of the first snapshot, counted from 0.
     pub first: u32,
@@ -37,10 +37,14 @@ impl SnapshotRange {
 /// of a sub-image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(rename = "Tile")]
 pub struct TileSpec {
     /// Side of a tile.
+    #[schemars(range(min = 16, max = 8192))]
     pub size: usize,
     /// Smallest overlap between neighbours.
+    #[schemars(range(max = 4096))]
     pub overlap: usize,
 }
 
@@ -57,6 +61,7 @@ impl TileSpec {
 )]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
 pub enum Sequence {
     /// There is no pause between snapshots, so they may be reconstructed together.
     Contiguous,
@@ -79,7 +84,8 @@ impl Sequence {
 
 /// How contiguous snapshots are reconstructed together: in runs of at most `length` snapshots that share at least
 /// `overlap` with their neighbours. See [`reconstruction::sequence::SequencePlan::new`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
+#[schemars(rename = "Runs")]
 pub struct RunSpec {
     /// Largest number of snapshots in a run; 1 reconstructs each alone.
     pub length: u32,
@@ -175,7 +181,7 @@ impl Cut {
 }
 
 /// The size of a measurement.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct SceneShape {
     pub frames: usize,
     pub height: usize,

@@ -20,6 +20,7 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 )]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
+#[derive(schemars::JsonSchema)]
 pub enum JobState {
     /// Accepted; no task has been claimed.
     Queued,

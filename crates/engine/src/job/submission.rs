@@ -14,6 +14,8 @@ const MODEL_S: f64 = 1.0;
 /// The body of `POST /v1/calibrations`: masks, or the captures from which they are made.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
+#[schemars(extend("anyOf" = [{ "required": ["masks"] }, { "required": ["captures"] }]))]
 pub struct CalibrationRequest {
     pub name: Option<Label>,
     pub masks: Option<Sha256>,
@@ -23,6 +25,10 @@ pub struct CalibrationRequest {
     /// Order of the array's axes; without it, the only one that fits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
+    /// The stored number that means 1. By default 255 for uint8, 65535 for uint16, and 1 for floats and truth values; in
+    /// `.mat` files 1 for `mask` and 255 for `meas`. Masks of other integers must be 0 or 1; measurements of other integers
+    /// need it.
+    #[schemars(range(min = 1.2e-38, max = 3.4e38))]
     pub full_scale: Option<f32>,
     pub captures: Option<Captures>,
     /// Colours of the sensor's pixels; a grey sensor has none.
@@ -33,6 +39,7 @@ pub struct CalibrationRequest {
 /// The body of `POST /v1/measurements`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
 pub struct MeasurementRequest {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
@@ -45,13 +52,21 @@ pub struct MeasurementRequest {
     pub axes: Option<Axes>,
     /// Captures with the LCoS all black, at the measurement's exposure. The average of the captures is subtracted.
     #[serde(default)]
+    #[schemars(length(max = 4096))]
     pub dark: Vec<Sha256>,
     /// Smallest stored number of a saturated pixel.
+    #[schemars(range(min = 1))]
     pub saturation: Option<u32>,
+    /// The stored number that means 1. By default 255 for uint8, 65535 for uint16, and 1 for floats and truth values; in
+    /// `.mat` files 1 for `mask` and 255 for `meas`. Masks of other integers must be 0 or 1; measurements of other integers
+    /// need it.
+    #[schemars(range(min = 1.2e-38, max = 3.4e38))]
     pub full_scale: Option<f32>,
     /// Snapshots per second.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1e9))]
     pub camera_fps: Option<f64>,
     /// Exposure of one snapshot in seconds.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1e5))]
     pub exposure_s: Option<f64>,
     /// States whether the snapshots follow one another; without it, the times decide.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -61,6 +76,7 @@ pub struct MeasurementRequest {
 /// The body of `POST /v1/models`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[derive(schemars::JsonSchema)]
 pub struct ModelRequest {
     pub name: Option<Label>,
     pub calibration: CalibrationId,

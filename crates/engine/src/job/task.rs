@@ -236,6 +236,7 @@ fn work_order(tile: u32) -> f64 {
 )]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
+#[derive(schemars::JsonSchema)]
 pub enum TaskState {
     /// Waits for other tasks of the job.
     Blocked,
@@ -286,7 +287,7 @@ impl TaskProgress {
 }
 
 /// A file of a result.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ResultFile {
     /// Path below the folder of the snapshot or job, such as `frames/frame_0001.exr`.
     pub name: String,

@@ -1,11 +1,13 @@
 //! Validated text values: labels, hashes and times, and the errors of invalid ones.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::io::{self, BufReader, Read};
 use std::str::FromStr;
 use std::time::Duration;
 
 use derive_more::Display;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Serialize;
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 
@@ -23,7 +25,7 @@ impl InvalidText {
 }
 
 /// A violation in a request, and its place.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct InvalidField {
     /// JSON pointer (RFC 6901) into the request.
     pub pointer: String,
@@ -59,6 +61,22 @@ impl Label {
 
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+}
+
+impl JsonSchema for Label {
+    fn schema_name() -> Cow<'static, str> {
+        "Label".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({
+            "type": "string",
+            "description": "A name for people, not blank and without control characters.",
+            "minLength": 1,
+            "maxLength": Self::MAX_CHARS,
+            "pattern": r"^[^\x00-\x1f\x7f-\x9f]*[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]*$",
+        })
     }
 }
 
@@ -124,6 +142,20 @@ impl fmt::Display for Sha256 {
     }
 }
 
+impl JsonSchema for Sha256 {
+    fn schema_name() -> Cow<'static, str> {
+        "Sha256".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({
+            "type": "string",
+            "pattern": "^[0-9a-f]{64}$",
+            "example": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+        })
+    }
+}
+
 impl FromStr for Sha256 {
     type Err = InvalidText;
 
@@ -145,6 +177,18 @@ impl FromStr for Sha256 {
     Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay, DeserializeFromStr,
 )]
 pub struct Timestamp(pub i64);
+
+impl JsonSchema for Timestamp {
+    fn schema_name() -> Cow<'static, str> {
+        "Moment".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({
+            "type": "string", "format": "date-time", "example": "2026-11-21T10:39:01.000Z",
+        })
+    }
+}
 
 impl FromStr for Timestamp {
     type Err = InvalidText;

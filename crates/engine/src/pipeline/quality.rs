@@ -7,11 +7,12 @@ use formats::Channels;
 use reconstruction::{ReconError, metrics};
 
 /// The quality of one frame.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct FrameQuality {
     /// Number of the frame, counted from 1.
     pub frame: usize,
-    /// PSNR in dB; infinite if the frame equals its truth.
+    /// PSNR in dB; infinite, and null in JSON, if the frame equals its truth.
+    #[schemars(with = "Option<f64>")]
     pub psnr: f64,
     /// SSIM; `None` if the frame is smaller than the SSIM window.
     pub ssim: Option<f64>,
@@ -42,9 +43,10 @@ impl FrameQuality {
 }
 
 /// The quality of all frames of a snapshot.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, schemars::JsonSchema)]
 pub struct Quality {
-    /// Mean PSNR over the frames in dB.
+    /// Mean PSNR over the frames in dB; null in JSON if a frame equals its truth.
+    #[schemars(with = "Option<f64>")]
     pub psnr: f64,
     /// Mean SSIM over the frames; `None` if a frame has none.
     pub ssim: Option<f64>,

@@ -17,52 +17,41 @@ pub enum Movie {
         sha256: Sha256,
         size: u64,
     },
-    /// The share that is done, on \[0,1\]; `None` until a worker has begun.
+    /// Share of the work that is done, on \[0,1\]; none until a worker begins.
     Asked(Option<f64>),
-    /// It failed, for this reason; the next request tries again.
+    /// It could not be made, for this reason. [`Store::create_movie`] tries again.
     Failed(String),
 }
 
 impl Store {
-    /// Finds the movie of a snapshot of a job (or, with none, of all), or asks for it if nobody has, or if it is
-    /// damaged. The frames must be there.
-    /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if the job was deleted.
-    pub async fn movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
-        let place = place(snapshot);
-        let found = sql!(FIND, [job.id, place]).fetch_optional(&self.readers).await?;
-        if let Some(row) = found
-            && let state @ (TaskState::Ready | TaskState::Running | TaskState::Done) =
-                row.read("state")?
-        {
-            let (sha256, size): (Option<Sha256>, Option<u64>) =
-                (row.read("result")?, row.read("size")?);
-            let fraction: f64 = row.read("fraction")?;
-            match (state, sha256.zip(size)) {
-                (TaskState::Done, None) => {}
-                (_, Some((sha256, size))) => return Ok(Movie::Ready { sha256, size }),
-                (TaskState::Running, None) => return Ok(Movie::Asked(Some(fraction))),
-                (_, None) => return Ok(Movie::Asked(None)),
+    /// The movie of a snapshot of a job (or, with none, of all); none if nobody has asked for it, or if it is damaged.
+    pub async fn movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Option<Movie>> {
+        let found = sql!(FIND, [job.id, place(snapshot)]).fetch_optional(&self.readers).await?;
+        let Some(row) = found else { return Ok(None) };
+        let (sha256, size): (Option<Sha256>, Option<u64>) =
+            (row.read("result")?, row.read("size")?);
+        Ok(match (row.read("state")?, sha256.zip(size)) {
+            (TaskState::Done, Some((sha256, size))) => Some(Movie::Ready { sha256, size }),
+            (TaskState::Running, _) => Some(Movie::Asked(Some(row.read("fraction")?))),
+            (TaskState::Ready, _) => Some(Movie::Asked(None)),
+            (TaskState::Failed, _) => {
+                let reason: Option<String> = row.read("reason")?;
+                Some(Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into())))
             }
-        }
-        self.ask_movie(job, snapshot).await
+            _ => None,
+        })
     }
 
-    /// Requests a movie, or reports why the last attempt failed.
-    async fn ask_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
-        let place = place(snapshot);
-        let mut transaction = self.write().await?;
-        let failed: Option<Option<String>> = sql_as!(
-            "SELECT (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt)
-             FROM tasks WHERE thing = ? AND coalesce(snapshot, -1) = ? AND state = ?",
-            [job.id, place, TaskState::Failed]
-        )
-        .fetch_optional(&mut *transaction)
-        .await?;
-        self.drop_movies(&mut transaction, job.id, Some(place)).await?;
-        if let Some(reason) = failed {
-            self.commit_removals(transaction).await?;
-            return Ok(Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into())));
+    /// Asks for a movie, unless it exists or is being made. A failed one is tried again. The frames must exist.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if the job was deleted.
+    pub async fn create_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
+        if let Some(found @ (Movie::Ready { .. } | Movie::Asked(_))) =
+            self.movie(job, snapshot).await?
+        {
+            return Ok(found);
         }
+        let mut transaction = self.write().await?;
+        self.drop_movies(&mut transaction, job.id, Some(place(snapshot))).await?;
         quota::check(&mut transaction, &job.lab, None, job.spec.movie_bytes(snapshot)).await?;
         let known = sql!("SELECT 1 FROM jobs WHERE id = ?", [job.id]);
         let known = known.fetch_optional(&mut *transaction).await?;
@@ -95,7 +84,9 @@ impl Store {
 }
 
 /// A damaged one is as good as none.
-const FIND: &str = "SELECT state, fraction, result, size FROM tasks
+const FIND: &str = "SELECT state, fraction, result, size,
+        (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt) AS reason
+    FROM tasks
     LEFT JOIN blobs ON sha256 = result AND damaged_at IS NULL
     WHERE thing = ? AND coalesce(snapshot, -1) = ?";
 

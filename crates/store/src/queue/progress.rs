@@ -18,40 +18,41 @@ use engine::job::{JobId, JobState, TaskKind, TaskStage};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
 pub enum ProgressStage {
-    /// No worker has taken it up.
+    /// No worker has claimed a task of the job.
     Waiting,
-    /// The scale of the scene is estimated.
+    /// A worker estimates the scale of the scene.
     Preparing,
-    /// Tiles run, all of those running with TV.
+    /// All running tiles are in a stage with total variation.
     Tv,
-    /// Tiles run, at least one with a learned denoiser.
+    /// A running tile is in a stage with a learned denoiser.
     Deep,
-    /// Tiles run, none with a learned denoiser, at least one with the nonlocal prior.
+    /// A running tile is in a stage with the nonlocal prior, and none with a learned denoiser.
     Nonlocal,
-    /// Frames are blended and written.
+    /// A worker blends and writes frames.
     Assembling,
     /// The job has ended.
     Ended,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Progress")]
 pub struct JobProgress {
     pub stage: ProgressStage,
-    /// The share of the planned cost that is behind it, in percent.
+    /// Share of the planned cost that is done, in percent.
     pub percent: f64,
-    /// Seconds until it ends; none if it has ended or no worker lives.
+    /// Seconds until the end; null if the job has ended or no worker lives.
     pub eta_seconds: Option<f64>,
-    /// Its place among the jobs that wait, from 1 for the next to be taken up; none if it does not
-    /// wait.
+    /// Place among the waiting jobs, from 1; null if the job does not wait.
     pub queue_position: Option<usize>,
     pub tiles_done: u64,
     pub tiles_total: u64,
-    /// Tiles that a worker has in hand; one that is out with other machines and waits for a worker is none.
+    /// Tiles that workers are computing.
     pub tiles_running: u64,
-    /// Snapshots that can be downloaded.
+    /// Snapshots with results.
     pub snapshots_done: u64,
-    /// Snapshots with a preview; previews go when the job has succeeded.
+    /// Snapshots with a preview; 0 once the job has succeeded.
     pub previews_done: u64,
     /// Solver iterations done, over all tiles and the pilot.
     pub iterations_done: u64,
@@ -60,11 +61,12 @@ pub struct JobProgress {
 }
 
 /// The queue as a new job would find it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Forecast")]
 pub struct Estimate {
-    /// Seconds until it would end; none if no worker lives.
+    /// Seconds until the job would end, behind all present jobs; null if no worker lives.
     pub eta_seconds: Option<f64>,
-    /// Its place among the jobs that wait, from 1.
+    /// Place among the waiting jobs, from 1.
     pub queue_position: usize,
 }
 

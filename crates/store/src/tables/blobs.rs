@@ -12,10 +12,11 @@ use crate::tables::quota;
 use crate::{Store, on_files, removal};
 use engine::job::{Lab, Sha256, Timestamp, TokenId};
 
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct Blob {
-    /// The hash of its bytes, which is its address.
+    /// Hash of the bytes, which is the address of the file.
     pub sha256: Sha256,
+    /// Bytes.
     pub size: u64,
     /// When the lab first sent it.
     pub created_at: Timestamp,
@@ -24,11 +25,12 @@ pub struct Blob {
 from_row!(Blob, row => { sha256, size, created_at });
 
 /// An upload in a list.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "BlobItem")]
 pub struct BlobRow {
     #[serde(flatten)]
     pub blob: Blob,
-    /// True while something of the lab refers to it: it is not deleted then.
+    /// True while a resource of the lab refers to the file, which prevents its deletion.
     pub in_use: bool,
 }
 

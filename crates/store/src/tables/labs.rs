@@ -27,10 +27,11 @@ pub struct LabRow {
 from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs });
 
 /// Use of the service by a lab.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct LabUse {
-    /// Uploads, and their bytes.
+    /// Uploaded files.
     pub uploads: u64,
+    /// Bytes of the uploaded files.
     pub upload_bytes: u64,
     /// Bytes of the frames, movies and other files of its jobs.
     pub result_bytes: u64,

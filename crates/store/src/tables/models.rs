@@ -13,7 +13,7 @@ use crate::tables::requests;
 use engine::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 
 /// Facts of an end-to-end network that has passed its check.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct NewModel {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
@@ -29,7 +29,7 @@ from_row!(NewModel, row => {
     facts = row.read::<Json<_>>("facts")?.0,
 });
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct Model {
     pub id: ModelId,
     pub created_at: Timestamp,

@@ -50,7 +50,8 @@ pub struct TaskRecord {
     pub attempt: u32,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "TileProgress")]
 pub struct TileState {
     /// The first snapshot of its run.
     #[serde(skip)]
@@ -58,14 +59,16 @@ pub struct TileState {
     /// The number of snapshots in its run.
     #[serde(skip)]
     pub snapshots: u32,
+    /// Index of the tile in the plan.
     pub tile: u32,
     pub state: TaskState,
+    /// Activity of the worker.
     pub stage: Option<String>,
     /// Iterations of the attempt that runs or ran last.
     pub iterations: u32,
     /// Deep passes of that attempt.
     pub passes: u32,
-    /// The share of the planned cost that is behind it.
+    /// Share of the planned cost that is done, from 0 to 1.
     pub fraction: f64,
     pub attempts: u32,
     /// `||y - H v|| / ||y||` of a tile that is done.
@@ -86,15 +89,38 @@ from_row!(TileState, row => {
 });
 
 /// Convergence history of a tile.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, schemars::JsonSchema)]
 pub struct TileHistory {
     pub tile: u32,
     pub state: TaskState,
-    /// \[iteration, residual, change, sigma or null\], by iteration; many iterations are thinned out.
+    /// The iteration, its residual, the relative change, and sigma or null; at most 129 points.
+    #[schemars(with = "Vec<[Option<f64>; 4]>")]
     pub points: Vec<Value>,
 }
 
 from_row!(TileHistory, row => { tile, state, points = row.read::<Json<_>>("history")?.0 });
+
+/// The task for which a job has failed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FailedTask {
+    pub kind: TaskKind,
+    pub cause: FailureCause,
+    /// Attempts that have ended badly.
+    pub attempts: u32,
+}
+
+/// Why the last attempt at a task has ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FailureCause {
+    /// The task reported an error.
+    Task,
+    /// Workers were killed for lack of memory.
+    Memory,
+    /// The worker crashed.
+    Crash,
+    /// Workers were killed or fell silent.
+    Loss,
+}
 
 /// Totals of the completed tasks of a kind, deleted jobs included.
 #[derive(Debug, Clone, PartialEq)]
@@ -113,6 +139,29 @@ from_row!(TaskTotals, row => { kind, tasks, seconds, iterations, passes });
 pub type TaskCounts = BTreeMap<(String, TaskState), u64>;
 
 impl Store {
+    /// The task for which a job has failed; none unless it has.
+    pub async fn failed_task(&self, job: JobId) -> Result<Option<FailedTask>> {
+        let row = sql!(
+            "SELECT job, thing, kind, snapshot, snapshots, tile, failures, losses, starved,
+                 (SELECT outcome FROM attempts WHERE task = id AND attempt = tasks.attempt) AS outcome
+             FROM tasks WHERE job = ? AND state = ? ORDER BY id LIMIT 1",
+            [job, TaskState::Failed]
+        )
+        .fetch_optional(&self.readers)
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let (failures, losses, starved): (u32, u32, u32) =
+            (row.read("failures")?, row.read("losses")?, row.read("starved")?);
+        let outcome: Option<String> = row.read("outcome")?;
+        let cause = match outcome.as_deref() {
+            Some("crashed") => FailureCause::Crash,
+            Some("lost") if starved > 0 => FailureCause::Memory,
+            Some("lost") => FailureCause::Loss,
+            _ => FailureCause::Task,
+        };
+        Ok(Some(FailedTask { kind: kind(&row)?, cause, attempts: failures + losses + starved }))
+    }
+
     /// The stored preview of a snapshot, while there is one: a prepared array of coarse frames.
     pub async fn preview(&self, job: JobId, snapshot: u32) -> Result<Option<(Sha256, PathBuf)>> {
         let sha256: Option<Sha256> = sql_as!(

@@ -11,7 +11,8 @@ use crate::columns::{Columns, FromRow, from_row, sql, sql_as};
 use crate::error::Result;
 use engine::job::{CalibrationId, JobId, Timestamp, WorkerId};
 
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Worker")]
 pub struct WorkerRow {
     pub id: WorkerId,
     pub pid: u32,
@@ -20,6 +21,7 @@ pub struct WorkerRow {
     pub place: WorkerPlace,
     pub started_at: Timestamp,
     pub seen_at: Timestamp,
+    /// The running task.
     pub task: Option<WorkerTask>,
 }
 
@@ -33,21 +35,21 @@ pub enum WorkerTakes {
 }
 
 /// Where a worker is that came over the network; empty for one of this machine.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct WorkerPlace {
     pub host: Option<String>,
     pub pool: Option<String>,
-    /// Where it computes: cpu, or cuda:0.
+    /// Device: cpu, or cuda:0.
     pub device: Option<String>,
 }
 
 from_row!(WorkerPlace, row => { host, pool, device });
 
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, schemars::JsonSchema)]
 pub struct WorkerTask {
-    /// The job that it is a part of, or makes something of.
+    /// The job of the task.
     pub job: Option<JobId>,
-    /// The calibration that it makes, or reports on.
+    /// The calibration of the task.
     pub calibration: Option<CalibrationId>,
     pub kind: String,
     pub snapshot: Option<u32>,
