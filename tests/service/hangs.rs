@@ -191,7 +191,7 @@ async fn a_task_that_exceeds_the_memory_limit_is_abandoned() {
     // The metrics below count these five. On a busy machine the task may also be lost in other
     // ways.
     assert!(error.contains("no memory left") && error.contains(" attempts)"), "{error}");
-    let peak = error.split("seen at ").nth(1).and_then(|text| text.split(' ').next());
+    let peak = error.split("it used ").nth(1).and_then(|text| text.split(' ').next());
     let peak: u64 = peak.and_then(|peak| peak.parse().ok()).unwrap_or_default();
     // The limit also counts pages of the program file, which another group may have loaded.
     assert!((1..=450).contains(&peak), "{error}");
