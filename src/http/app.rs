@@ -8,8 +8,8 @@ use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
-use super::error::Result;
 use super::context::Wait;
+use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
 use super::rendering::Pictures;

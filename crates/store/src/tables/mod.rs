@@ -31,6 +31,9 @@ pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
 pub use requests::{Asked, Request};
 pub use reservations::Reservations;
-pub use tasks::{FailedTask, FailureCause, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
+pub use tasks::{
+    FailedTask, FailureCause, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
+    TileState,
+};
 pub use tokens::Token;
 pub use workers::{WorkerPlace, WorkerRow, WorkerTakes, WorkerTask};
