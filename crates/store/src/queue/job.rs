@@ -133,7 +133,7 @@ impl Store {
     }
 }
 
-/// Shortens the records of a job that has succeeded. About 16 points of each convergence history remain. The
+/// Shortens the records of a job that has succeeded: the tables of jobs and of result files have the rest. About 16 points of each convergence history remain. The
 /// assessments of tiles go, since the assemblies have read them, and lists of files that `result_files` has, too.
 async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
     sql!(
@@ -152,6 +152,9 @@ async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result
     )
     .execute(&mut *connection)
     .await?;
+    sql!("UPDATE tasks SET record = 'null' WHERE job = ? AND kind = 'manifest'", [id])
+        .execute(&mut *connection)
+        .await?;
     sql!(
         "DELETE FROM attempts WHERE outcome = 'done' AND task IN (SELECT id FROM tasks WHERE job = ?)",
         [id]
