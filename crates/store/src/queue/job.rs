@@ -133,8 +133,8 @@ impl Store {
     }
 }
 
-/// Shortens the records of a job that has succeeded: the tables of jobs and of result files have the rest. About 16 points of each convergence history remain. The
-/// assessments of tiles go, since the assemblies have read them, and lists of files that `result_files` has, too.
+/// Shortens the records of a job that has succeeded: other tables and the assemblies have the rest. About 16 points of
+/// each convergence history remain.
 async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
     sql!(
         "UPDATE tasks SET record = json_remove(record, '$.assessment'),
