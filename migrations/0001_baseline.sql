@@ -432,7 +432,6 @@ CREATE TABLE tasks (
     result      TEXT REFERENCES blobs (sha256), -- of a tile or preview, until the job has succeeded; of a movie
     record      TEXT, -- what the worker has to report about it, as JSON
     history     TEXT, -- how the solver went: [iteration, residual, change, sigma] as JSON
-    UNIQUE (job, ordinal),
     CHECK ((job IS NULL) <> (thing IS NULL))
 ) STRICT, WITHOUT ROWID;
 
