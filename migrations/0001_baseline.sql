@@ -226,6 +226,7 @@ CREATE INDEX models_calibration ON models (calibration);
 CREATE INDEX models_file ON models (file);
 
 CREATE TABLE jobs (
+    -- A table with row numbers, since its rows are large.
     id           TEXT PRIMARY KEY,
     lab          TEXT NOT NULL,
     calibration  TEXT NOT NULL REFERENCES calibrations (id),
@@ -243,7 +244,7 @@ CREATE TABLE jobs (
     created_at   INTEGER NOT NULL,
     started_at   INTEGER, -- first claim of a task
     finished_at  INTEGER
-) STRICT, WITHOUT ROWID;
+) STRICT;
 
 -- Hold all columns by which lists are filtered, so that a list reads few rows of the table.
 CREATE INDEX jobs_of_lab ON jobs (lab, id, state, calibration, measurement, label, created_at);
@@ -431,7 +432,6 @@ CREATE TABLE tasks (
     result      TEXT REFERENCES blobs (sha256), -- of a tile or preview, until the job has succeeded; of a movie
     record      TEXT, -- what the worker has to report about it, as JSON
     history     TEXT, -- how the solver went: [iteration, residual, change, sigma] as JSON
-    UNIQUE (job, ordinal),
     CHECK ((job IS NULL) <> (thing IS NULL))
 ) STRICT, WITHOUT ROWID;
 

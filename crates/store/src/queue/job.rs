@@ -133,13 +133,13 @@ impl Store {
     }
 }
 
-/// Shortens the records of a job that has succeeded. About 16 points of each convergence history remain. The
-/// assessments of tiles go, since the assemblies have read them, and lists of files that `result_files` has, too.
+/// Shortens the records of a job that has succeeded: other tables and the assemblies have the rest. About eight points
+/// of each convergence history remain.
 async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
     sql!(
         "UPDATE tasks SET record = json_remove(record, '$.assessment'),
              history = (SELECT json_group_array(json(value)) FROM json_each(history)
-                        WHERE key % (json_array_length(history) / 16 + 1) = 0
+                        WHERE key % (json_array_length(history) / 8 + 1) = 0
                            OR key = json_array_length(history) - 1)
          WHERE job = ? AND kind = 'tile'",
         [id]
@@ -152,6 +152,9 @@ async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result
     )
     .execute(&mut *connection)
     .await?;
+    sql!("UPDATE tasks SET record = 'null' WHERE job = ? AND kind = 'manifest'", [id])
+        .execute(&mut *connection)
+        .await?;
     sql!(
         "DELETE FROM attempts WHERE outcome = 'done' AND task IN (SELECT id FROM tasks WHERE job = ?)",
         [id]
