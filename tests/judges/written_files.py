@@ -9,6 +9,7 @@ import gzip
 import io
 import json
 import pathlib
+import struct
 import sys
 import tarfile
 import zipfile
@@ -58,6 +59,64 @@ def level73(place):
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64 HDF5 schema 1.00 .".ljust(116) + b"\0" * 8 + b"\0\x02IM")
 
 
+# A placeholder that `retag` turns into a tag that tifffile does not write.
+TAG = {"metadata": None, "software": False, "extratags": [(65000, 3, 1, 7, True)]}
+REVERSED = np.array([int(f"{byte:08b}"[::-1], 2) for byte in range(256)], "u1")
+
+
+def retag(place, tag, value, change=None):
+    """Replaces the placeholder of each page by a tag, and changes the bytes of the pixels."""
+    data = bytearray(place.read_bytes())
+    pages = [(page.offset, page.dataoffsets, page.databytecounts) for page in tifffile.TiffFile(place).pages]
+    for offset, starts, lengths in pages:
+        count = int.from_bytes(data[offset : offset + 2], "little")
+        entries = [bytes(data[offset + 2 + 12 * k : offset + 14 + 12 * k]) for k in range(count)]
+        new = struct.pack("<HHIHH", tag, 3, 1, value, 0)
+        entries = [new if entry[:2] == struct.pack("<H", 65000) else entry for entry in entries]
+        entries.sort(key=lambda entry: int.from_bytes(entry[:2], "little"))
+        data[offset + 2 : offset + 2 + 12 * count] = b"".join(entries)
+    # A contiguous stack has one range for all pages.
+    for start, length in {(start, length) for _, starts, lengths in pages for start, length in zip(starts, lengths)}:
+        if change:
+            data[start : start + length] = change(np.frombuffer(data[start : start + length], "u1")).tobytes()
+    place.write_bytes(data)
+
+
+def packed_tiff(place, values, bits):
+    """Writes samples of `bits` bits, most significant bit first, each row from a whole byte."""
+    digits = (values[..., None] >> np.arange(bits)[::-1]) & 1
+    rows = np.packbits(digits.reshape(*values.shape[:2], -1).astype("u1"), axis=-1)
+    height, width = values.shape[1:]
+    data = bytearray(b"II*\0\0\0\0\0")
+    link = 4
+    for page in rows:
+        start = len(data)
+        data += page.tobytes()
+        data += b"\0" * (len(data) % 2)
+        tags = [(256, width), (257, height), (258, bits), (259, 1), (262, 1), (273, start), (277, 1), (278, height), (279, page.size)]
+        data[link : link + 4] = struct.pack("<I", len(data))
+        data += struct.pack("<H", len(tags)) + b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+        link = len(data)
+        data += b"\0\0\0\0"
+    place.write_bytes(data)
+
+
+def ome_tiff(place, pages, order="XYCZT", along="T", **attributes):
+    """Writes the masks so that plane k, along this dimension, is page `pages[k]`."""
+    sizes = "".join(f' Size{axis}="{4 if axis == along else 1}"' for axis in "CZT")
+    planes = "".join(
+        f'<TiffData First{along}="{plane}" IFD="{page}" PlaneCount="1"/>' for plane, page in enumerate(pages)
+    )
+    text = (
+        '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
+        f'<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="{order}" Type="uint8" SizeX="64" SizeY="48"{sizes}>'
+        f"{attributes.get('planes', planes)}</Pixels></Image>{attributes.get('more', '')}</OME>"
+    )
+    stored = np.empty_like(EIGHT)
+    stored[pages] = EIGHT
+    tifffile.imwrite(place, stored, photometric="minisblack", description=text, metadata=None)
+
+
 def png(values):
     file = io.BytesIO()
     Image.fromarray(values).save(file, "png")
@@ -98,7 +157,40 @@ def accepted():
         pages = [Image.fromarray(page) for page in EIGHT]
         pages[0].save(path(row, "a.tif"), save_all=True, append_images=pages[1:], compression=compression)
     imageio.imwrite(path(row, "a.tif"), EIGHT, is_batch=True, photometric="minisblack")
+    for code in ["<u4", "<i2", ">i4", "i1", "<f2"]:
+        tifffile.imwrite(path(row, "a.tif"), MASKS.astype(code), photometric="minisblack")
+    tifffile.imwrite(path(row, "a.tif", **snapshots), SNAPSHOTS.astype("<u4"), photometric="minisblack")
+    for compression in ["zlib", "lzw"]:
+        tifffile.imwrite(path(row, "a.tif"), MASKS.astype("f4"), photometric="minisblack", compression=compression, predictor=3)
+        tifffile.imwrite(path(row, "a.tif"), EIGHT, photometric="minisblack", compression=compression, predictor=2, tile=(32, 32))
+    for file in [path(row, "a.tif"), path(row, "a.tif")]:
+        page = EIGHT if len(index) % 2 else (MASKS * 65535).astype("<u2")
+        # Bits in reverse order, as some scanners store them.
+        tifffile.imwrite(file, page.view("u1").reshape(4, 48, -1) if page.itemsize == 1 else page, photometric="minisblack", **TAG)
+        retag(file, 266, 2, lambda data: REVERSED[data])
+    tifffile.imwrite(path(row, "a.tif"), MASKS.astype(bool), photometric="minisblack", **TAG)
+    retag(FOLDER / index[-1]["file"], 266, 2, lambda data: REVERSED[data])
+    for bits in [2, 4, 10, 12, 14]:
+        packed_tiff(path(row, "a.tif"), MASKS * (2**bits - 1), bits)
+    # A palette of greys in proportion to the stored numbers.
+    ramp = np.repeat((np.arange(256) * 257).astype("u2")[None], 3, axis=0)
+    tifffile.imwrite(path(row, "a.tif"), EIGHT, photometric="palette", colormap=ramp)
+    # A smaller copy of the first page, as microscopes add it.
+    with tifffile.TiffWriter(path(row, "a.tif")) as file:
+        for frame in EIGHT:
+            file.write(frame, photometric="minisblack", contiguous=False)
+            file.write(frame[::4, ::4], photometric="minisblack", subfiletype=1)
+    with tifffile.TiffWriter(path(row, "a.tif")) as file:
+        for frame in EIGHT:
+            file.write(frame, photometric="minisblack", subifds=1, contiguous=False)
+            file.write(frame[::2, ::2], photometric="minisblack", subfiletype=1)
+    row = "OME-TIFF"
+    for order, sizes in [("XYCZT", "TZC"), ("XYZTC", "ZTC"), ("XYTCZ", "ZTC")]:
+        ome_tiff(path(row, "a.tif"), list(range(4)), order, sizes[0])
+        ome_tiff(path(row, "a.tif"), [3, 2, 1, 0], order, sizes[1])
+        ome_tiff(path(row, "a.tif"), [2, 0, 3, 1], order, sizes[2])
     row = "ImageJ stack, also above 4 GB"
+    tifffile.imwrite(path(row, "a.tif"), EIGHT, photometric="minisblack", truncate=True)
     tifffile.imwrite(path(row, "a.tif"), EIGHT, imagej=True)
     tifffile.imwrite(path(row, "a.tif"), MASKS.astype("f4"), imagej=True, truncate=True)
     row = "PNG"
@@ -115,6 +207,10 @@ def accepted():
         tifffile.imwrite(file, frame, photometric="minisblack")
         tiffs.append((f"run 3/{k:04}.tif", file.getvalue()))
     zipped(path(row, "a.zip"), tiffs, zipfile.ZIP_DEFLATED)
+    beside = [(name, b"") for name in ["README.txt", "Thumbs.db", "desktop.ini", "scan.xml"]]
+    zipped(path(row, "a.zip"), [*beside, *[(f"img{k + 8}.png", png(frame)) for k, frame in enumerate(EIGHT)]])
+    timed = [(f"shot{k + 8}_{250 * k}ms.png", png(frame)) for k, frame in enumerate(EIGHT)]
+    zipped(path(row, "a.zip"), timed[::-1])
     row = "tar of images"
     for form in [tarfile.PAX_FORMAT, tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT]:
         with tarfile.open(path(row, "a.tar"), "w", format=form) as archive:
@@ -173,13 +269,69 @@ def refused():
     pages[0].save(path(row, "in.png"), save_all=True, append_images=pages[1:])
     row = "colour TIFF"
     tifffile.imwrite(path(row, "in.tif", frames=1), colours, photometric="rgb")
+    four = np.repeat(EIGHT[..., None], 3, axis=3)
+    tifffile.imwrite(path(row, "in.tif"), (four / 255).astype("f4"), photometric="rgb")
+    tifffile.imwrite(path(row, "in.tif"), four.astype("<u2") * 257, photometric="rgb", compression="zlib")
+    opaque = np.concatenate([four, np.full_like(four[..., :1], 255)], axis=3)
+    tifffile.imwrite(path(row, "in.tif"), opaque, photometric="rgb", extrasamples=["unassalpha"])
+    row = "colour TIFF in separate planes"
+    tifffile.imwrite(path(row, "in.tif"), np.moveaxis(four, -1, 1).astype("<u2") * 257, photometric="rgb", planarconfig="separate")
+    row = "TIFF with grey and transparency"
+    tifffile.imwrite(path(row, "in.tif"), opaque[..., 2:], photometric="minisblack", extrasamples=["unassalpha"])
+    tifffile.imwrite(path(row, "in.tif"), (opaque[..., 2:] / 255).astype("f4"), photometric="minisblack", extrasamples=["assocalpha"])
+    row = "TIFF with grey and transparency in separate planes"
+    planes = np.moveaxis(opaque[..., 2:], -1, 1)
+    tifffile.imwrite(path(row, "in.tif"), planes, photometric="minisblack", planarconfig="separate", extrasamples=["unassalpha"])
+    row = "TIFF with all frames in the samples of a pixel"
+    samples = np.moveaxis(MASKS, 0, -1).astype("f4")
+    tifffile.imwrite(path(row, "in.tif"), samples, photometric="minisblack", planarconfig="contig")
+    row = "TIFF with all frames as planes of a page"
+    tifffile.imwrite(path(row, "in.tif"), MASKS.astype("f4"), photometric="minisblack", planarconfig="separate")
+    row = "TIFF with a palette of colours"
+    palette = np.random.default_rng(2).integers(0, 65536, (3, 256)).astype("u2")
+    palette[:, 7], palette[:, 9] = 0, 65535
+    tifffile.imwrite(path(row, "in.tif"), np.where(MASKS > 0, 9, 7).astype("u1"), photometric="palette", colormap=palette)
+    row = "TIFF with a palette for display only"
+    palette[:, 7], palette[:, 9] = 100, 200
+    tifffile.imwrite(path(row, "in.tif"), EIGHT, photometric="palette", colormap=palette)
+    row = "CMYK TIFF"
+    Image.fromarray(colours).convert("CMYK").save(path(row, "in.tif", frames=1))
     row = "TIFF with another sample type"
-    for code in ["<u4", "<i2", "<f2"]:
-        tifffile.imwrite(path(row, "in.tif"), MASKS.astype(code), photometric="minisblack")
+    packed_tiff(path(row, "in.tif", full_scale=2**24 - 1), MASKS * (2**24 - 1), 24)
+    row = "TIFF with samples of an undefined type"
+    tifffile.imwrite(path(row, "in.tif"), (MASKS * 65535).astype("<u2"), photometric="minisblack", **TAG)
+    retag(FOLDER / index[-1]["file"], 339, 4)
     row = "TIFF in which 0 is white"
     tifffile.imwrite(path(row, "in.tif"), 255 - EIGHT, photometric="miniswhite")
+    tifffile.imwrite(path(row, "in.tif"), 65535 - (MASKS * 65535).astype("<u2"), photometric="miniswhite")
+    tifffile.imwrite(path(row, "in.tif"), MASKS == 0, photometric="miniswhite")
+    row = "TIFF of floats in which 0 is white"
+    tifffile.imwrite(path(row, "in.tif"), MASKS.astype("f4"), photometric="miniswhite")
     row = "TIFF with another compression"
-    pages[0].save(path(row, "in.tif"), save_all=True, append_images=pages[1:], compression="zstd")
+    for compression in ["zstd", "lzma", "png", "jpeg2000", "lerc"]:
+        arguments = {"compressionargs": {"level": 0}} if compression == "jpeg2000" else {}
+        tifffile.imwrite(path(row, "in.tif"), EIGHT, photometric="minisblack", compression=compression, **arguments)
+    pages[0].convert("1").save(path(row, "in.tif"), save_all=True, append_images=[page.convert("1") for page in pages[1:]], compression="group4")
+    row = "TIFF that turns or mirrors its pictures"
+    tifffile.imwrite(path(row, "in.tif"), EIGHT, photometric="minisblack", extratags=[(274, 3, 1, 3, True)])
+    row = "TIFF with a predictor but no compression"
+    tifffile.imwrite(path(row, "in.tif"), EIGHT, photometric="minisblack", **TAG)
+    retag(FOLDER / index[-1]["file"], 317, 2)
+    row = "TIFF with its frames in sub-images"
+    with tifffile.TiffWriter(path(row, "in.tif")) as file:
+        file.write(EIGHT[0, ::4, ::4], photometric="minisblack", subifds=4, subfiletype=1)
+        for frame in EIGHT:
+            file.write(frame, photometric="minisblack", contiguous=False)
+    row = "ImageJ stack with converted numbers"
+    converted = {"c0": -32768.0, "c1": 1.0, "cf": 0}
+    tifffile.imwrite(path(row, "in.tif"), (MASKS + 32768).astype("u2"), imagej=True, metadata=converted)
+    row = "OME-TIFF of several images"
+    sizes = 'DimensionOrder="XYCZT" Type="uint8" SizeX="64" SizeY="48" SizeC="1" SizeZ="1" SizeT="1"'
+    more = f'<Image ID="Image:1"><Pixels ID="Pixels:1" {sizes}><TiffData IFD="0" PlaneCount="1"/></Pixels></Image>'
+    ome_tiff(path(row, "in.tif"), [0, 1, 2, 3], more=more)
+    row = "OME-TIFF whose description does not fit its pages"
+    ome_tiff(path(row, "in.tif"), [0, 1, 2, 3], planes='<TiffData IFD="0" PlaneCount="3"/>')
+    ome_tiff(path(row, "in.tif"), [0, 1, 2, 3], planes='<TiffData IFD="2" PlaneCount="4"/>')
     row = "TIFF with pages of several sizes"
     with tifffile.TiffWriter(path(row, "in.tif")) as file:
         for frame in MASKS.astype("f4"):
@@ -198,9 +350,17 @@ def refused():
     with gzip.open(place, "wb") as file:
         np.save(file, MASKS.astype("f4"))
     row = "ZIP with missing numbers or other files"
-    some = [(f"shot_{k}.png", png(frame)) for k, frame in zip([1, 2, 4, 5], EIGHT)]
+    # In natural order these are 1, 2, 10, 11; as texts 1, 10, 11, 2.
+    some = [(f"shot_{k}.png", png(frame)) for k, frame in zip([1, 2, 10, 11], EIGHT)]
     zipped(path(row, "in.zip"), some)
-    zipped(path(row, "in.zip"), [*some, ("read me.txt", b"text")])
+    numbered = [(f"shot_{k + 8}.png", png(frame)) for k, frame in enumerate(EIGHT)]
+    zipped(path(row, "in.zip"), [*numbered, ("overview.jpg", b"picture"), ("__MACOSX/._shot_8.png", b"")])
+    tiffs = []
+    for k, frame in zip([1, 2, 10, 11], MASKS):
+        file = io.BytesIO()
+        tifffile.imwrite(file, (frame * 65535).astype("u2"), photometric="minisblack")
+        tiffs.append((f"run/{k}.TIF", file.getvalue()))
+    zipped(path(row, "in.zip"), tiffs)
     row = "tar with missing numbers or other files"
     with tarfile.open(path(row, "in.tar"), "w") as archive:
         for name, content in some:

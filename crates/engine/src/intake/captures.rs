@@ -211,7 +211,7 @@ pub(super) fn average(
         let mut reader = formats::open_stack(path, limits).map_err(failed)?;
         let info = *reader.info();
         sample = info.sample;
-        let level = saturation_level(sample, saturation);
+        let level = saturation_level(&info, saturation);
         let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, level));
         let mut frame = 0;
         while let Some(capture) = reader.next_frame().map_err(failed)? {
@@ -226,13 +226,11 @@ pub(super) fn average(
     Ok((average.map_err(|error| IntakeError::content(place(0), &error))?, sample))
 }
 
-/// Stored value from which a pixel is saturated: the stated one, or the largest of the data type. Floats have no such
+/// Stored value from which a pixel is saturated: the stated one, or the largest of the file. Floats have no such
 /// default.
 #[allow(clippy::cast_precision_loss)] // camera values are small
-pub(super) fn saturation_level(sample: SampleType, stated: Option<u32>) -> Option<f32> {
-    let largest = sample.default_full_scale().filter(|largest| *largest != FullScale::ONE);
-    let largest = largest.map(FullScale::value);
-    stated.map(|value| value as f32).or(largest)
+pub(super) fn saturation_level(info: &StackInfo, stated: Option<u32>) -> Option<f32> {
+    stated.map(|value| value as f32).or(info.largest)
 }
 
 /// Reports the finished share of the work. Errors: [`IntakeError::Stopped`].

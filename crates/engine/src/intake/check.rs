@@ -84,7 +84,7 @@ pub fn measurement(
 ) -> Result<Passed> {
     let Opened { info, full_scale, reader, name } = opened;
     let dark = average_dark(&exposure.dark, (info.height, info.width), limits)?;
-    let saturation = saturation_level(info.sample, exposure.saturation);
+    let saturation = saturation_level(&info, exposure.saturation);
     let bits = (info.sample == SampleType::U16).then(BitUsage::default);
     let mut exposed = DarkCorrected { reader, dark, saturation, saturated: Vec::new(), bits };
     check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
