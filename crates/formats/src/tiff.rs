@@ -3,11 +3,12 @@
 mod colours;
 mod directory;
 mod ome;
+mod refusal;
+mod tags;
 
-use std::fmt::{self, Display};
-use std::io::{self, BufReader, ErrorKind, Read, Seek, SeekFrom};
+use std::fmt;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
-use ::tiff::TiffError;
 use ::tiff::decoder::{ChunkType, Decoder, DecodingResult, Limits as DecoderLimits};
 use ::tiff::tags::Tag;
 use ndarray::Array2;
@@ -16,14 +17,12 @@ use super::array::{ArrayReader, RawSamples, Restart};
 use super::axes::Layout;
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
 use crate::error::Result;
-use directory::{Pages, malformed};
+use directory::Pages;
+use refusal::malformed;
+use tags::{ACCEPTED_SAMPLES, Tags, UNCOMPRESSED, in_page};
 
-const ACCEPTED_SAMPLES: &str = "one grey sample per pixel (BlackIsZero): integers of 1 to 64 bits, or floats of 16, 32 or 64 bits (to \
-     convert others: python -c \"import imagecodecs, numpy, tifffile; numpy.save('out.npy', tifffile.imread('in.tif'))\")";
 const ACCEPTED_FORMATS: &str = "integers and floats (to convert others: python -c \"import imagecodecs, numpy, tifffile; numpy.save('out.npy', \
      [p.asarray() for p in tifffile.TiffFile('in.tif').pages])\")";
-const ACCEPTED_WHITE: &str = "BlackIsZero (to convert integers: python -c \"import tifffile; \
-     tifffile.imwrite('out.tif', ~tifffile.imread('in.tif'), photometric='minisblack')\")";
 const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits (to convert it: python -c \"import imagecodecs, numpy, tifffile; \
      numpy.save('out.npy', tifffile.imread('in.tif'))\")";
 const ACCEPTED_AS_STORED: &str = "rows from top to bottom and columns from left to right (to keep the pixels as they are stored: python -c \"import \
@@ -33,8 +32,6 @@ const ACCEPTED_PREDICTOR: &str = "a predictor with LZW or Deflate only (to ignor
 const ACCEPTED_IMAGEJ: &str =
     "contiguous images of 8, 16, 32 or 64 bits that are not compressed, or one page per frame";
 
-/// TIFF's number for no compression.
-const UNCOMPRESSED: u16 = 1;
 /// TIFF's number for PackBits.
 const PACK_BITS: u16 = 32773;
 /// TIFF's numbers for the supported compressions, all of them lossless.
@@ -44,8 +41,8 @@ const SUPPORTED_COMPRESSIONS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, PACK_BITS];
 const MAX_EXPANSION: u64 = 4096;
 
 /// Opens a TIFF file of `length` bytes. Its pages are frames of one size and type, or all frames follow one page
-/// header, as ImageJ writes them above 4 GB and tifffile on request. All headers are checked against the limits, the length and each other.
-/// Pixels are not read.
+/// header, as ImageJ writes them above 4 GB and tifffile on request. All headers are checked against the limits, the
+/// length and each other. Pixels are not read.
 pub(super) fn open<R: Read + Seek + Send + 'static>(
     mut file: R,
     length: u64,
@@ -163,16 +160,21 @@ impl<R: Read + Seek> TiffReader<R> {
         Ok(Self { decoder: decoder.with_limits(decoder_limits), pages, page, info, next: 0 })
     }
 
-    /// Reads the stored rows of the current page.
+    /// Reads the stored rows of the current page. Bytes that a strip lacks are 0.
     fn read_rows(&mut self, page: usize) -> Result<Vec<u8>> {
         let row_bytes = self.page.row_bytes();
+        let (_, strip_rows) = self.decoder.chunk_dimensions();
         let mut bytes = Vec::with_capacity(row_bytes * self.info.height);
         for (start, length) in chunk_ranges(&mut self.decoder, page)? {
+            let rows = (self.info.height - bytes.len() / row_bytes).min(strip_rows as usize);
+            let end = bytes.len() + rows * row_bytes;
             let file = self.decoder.inner();
+            let length = length.min((rows * row_bytes) as u64);
             let read = file
                 .seek(SeekFrom::Start(start))
                 .and_then(|_| file.by_ref().take(length).read_to_end(&mut bytes));
             read.map_err(FormatError::io("read the TIFF page"))?;
+            bytes.resize(end, 0);
         }
         bytes.resize(row_bytes * self.info.height, 0);
         Ok(bytes)
@@ -268,6 +270,9 @@ impl fmt::Display for Page {
         if self.is_packed() && self.bits > 1 {
             write!(f, " of {} bits", self.bits)?;
         }
+        if self.reversed {
+            write!(f, " in reverse order")?;
+        }
         Ok(())
     }
 }
@@ -295,34 +300,6 @@ fn read_page<R: Read + Seek>(
     let checked = Page { info, bits, reversed, by_rows };
     check_chunks(decoder, page, &checked, length, limits)?;
     Ok(checked)
-}
-
-/// Access to the tags of the current page.
-struct Tags<'a, R: Read + Seek> {
-    decoder: &'a mut Decoder<BufReader<R>>,
-    page: usize,
-}
-
-impl<R: Read + Seek> Tags<'_, R> {
-    fn number(&mut self, tag: Tag, default: u16) -> Result<u16> {
-        let value = self.decoder.find_tag_unsigned(tag).map_err(|e| in_page(self.page, e))?;
-        Ok(value.unwrap_or(default))
-    }
-
-    fn numbers(&mut self, tag: Tag) -> Result<Vec<u16>> {
-        let values = self.decoder.find_tag_unsigned_vec(tag).map_err(|e| in_page(self.page, e))?;
-        Ok(values.unwrap_or_default())
-    }
-
-    /// True for strips without compression.
-    fn is_plain(&mut self) -> Result<bool> {
-        let compression = self.number(Tag::Compression, UNCOMPRESSED)?;
-        Ok(compression == UNCOMPRESSED && self.decoder.get_chunk_type() == ChunkType::Strip)
-    }
-
-    fn refused(&self, found: impl Display, accepted: &'static str) -> FormatError {
-        directory::refused(format!("{found} (page {})", self.page), accepted)
-    }
 }
 
 /// The type of the samples, and their number of bits.
@@ -453,28 +430,6 @@ fn chunk_ranges<R: Read + Seek>(
             Ok(offsets.into_iter().zip(counts).collect())
         }
         _ => Err(malformed(format!("page {page} does not state the position of its pixels"))),
-    }
-}
-
-fn in_page(page: usize, error: TiffError) -> FormatError {
-    match error {
-        // Decompressors report invalid data as I/O errors, too; only errors of the operating system have a number.
-        TiffError::IoError(source) if source.raw_os_error().is_some() => {
-            FormatError::Io { action: "read the TIFF page", source }
-        }
-        TiffError::IoError(source) if source.kind() == ErrorKind::UnexpectedEof => {
-            FormatError::Truncated {
-                format: Format::Tiff,
-                promised: format!("page {page} (counted from 0)"),
-                present: "only a part of it".to_owned(),
-            }
-        }
-        TiffError::UnsupportedError(feature) => FormatError::Unsupported {
-            format: Format::Tiff,
-            found: format!("page {page}: {feature}"),
-            accepted: ACCEPTED_SAMPLES,
-        },
-        other => malformed(format!("page {page}: {other}")),
     }
 }
 

@@ -4,7 +4,7 @@ use std::io::{Read, Seek};
 
 use ::tiff::tags::Tag;
 
-use super::{ACCEPTED_WHITE, Tags};
+use super::tags::Tags;
 use crate::error::Result;
 
 /// Photometric interpretations.
@@ -17,6 +17,8 @@ const YCBCR: u16 = 6;
 /// Planar configuration of separate planes.
 const PLANES: u16 = 2;
 
+const ACCEPTED_WHITE: &str = "BlackIsZero (to convert integers: python -c \"import tifffile; \
+     tifffile.imwrite('out.tif', ~tifffile.imread('in.tif'), photometric='minisblack')\")";
 const RGB_PIXELS: &str = "grey, BlackIsZero (to convert colours to grey: python -c \"import imagecodecs, numpy, tifffile; a = \
      tifffile.imread('in.tif'); g = a[..., :3] @ [.299, .587, .114]; numpy.save('out.npy', (g if a.dtype.kind == \
      'f' else g.round()).astype(a.dtype))\")";

@@ -7,6 +7,7 @@ use std::collections::HashSet;
 use std::io::{Read, Seek, SeekFrom};
 
 use super::ome;
+use super::refusal::{malformed, refused};
 use crate::error::Result;
 use crate::samples::ByteOrder;
 use crate::{Format, FormatError, Limits};
@@ -315,12 +316,4 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
             ByteOrder::Big => bytes.iter().fold(0, shift),
         }
     }
-}
-
-pub(super) fn refused(found: String, accepted: &'static str) -> FormatError {
-    FormatError::Unsupported { format: Format::Tiff, found, accepted }
-}
-
-pub(super) fn malformed(problem: String) -> FormatError {
-    FormatError::malformed(Format::Tiff, problem)
 }

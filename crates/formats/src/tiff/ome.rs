@@ -2,7 +2,7 @@
 
 use roxmltree::{Document, Node, ParsingOptions};
 
-use super::directory::{malformed, refused};
+use super::refusal::{malformed, refused};
 use crate::error::Result;
 
 /// Largest number of nodes of a description. Each plane has a few.
