@@ -13,7 +13,7 @@ use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Limit, PageBody, Renaming, ShowQuery};
 use super::submissions::{Stage, make, patience, pending};
 use engine::job::{
-    CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Sha256, Submission, Timestamp,
+    CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Reading, Sha256, Submission, Timestamp,
 };
 use store::{Asked, Calibration, Filter, Made, Page, Request, Span};
 
@@ -51,6 +51,7 @@ pub(super) struct CalibrationBody {
     dead_pixels: Option<u64>,
     clipped_negatives: Option<u64>,
     mosaic: Option<Mosaic>,
+    reading: Option<Reading>,
 }
 
 impl From<Calibration> for CalibrationBody {
@@ -76,6 +77,7 @@ impl From<Calibration> for CalibrationBody {
             dead_pixels: Some(facts.dead_pixels),
             clipped_negatives: Some(facts.clipped_negatives),
             mosaic: facts.mosaic,
+            reading: facts.reading,
         }
     }
 }
@@ -109,6 +111,7 @@ impl From<Request> for CalibrationBody {
             dead_pixels: None,
             clipped_negatives: None,
             mosaic,
+            reading: None,
         }
     }
 }

@@ -12,8 +12,8 @@ use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{ListQuery, PageBody, Renaming, ShowQuery};
 use super::submissions::{Stage, make, patience, pending};
 use engine::job::{
-    CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Sequence, Sha256,
-    Submission, Timestamp,
+    CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Reading, Sequence,
+    Sha256, Submission, Timestamp,
 };
 use store::{Asked, Made, Measurement, Page, Request, StoreError};
 
@@ -41,6 +41,7 @@ pub(super) struct MeasurementBody {
     sequence: Option<Sequence>,
     dark: Vec<Sha256>,
     warnings: Vec<Finding>,
+    reading: Option<Reading>,
 }
 
 impl From<Measurement> for MeasurementBody {
@@ -66,6 +67,7 @@ impl From<Measurement> for MeasurementBody {
             sequence: Some(facts.sequence),
             dark: facts.dark,
             warnings: facts.warnings,
+            reading: Some(facts.reading),
         }
     }
 }
@@ -101,6 +103,7 @@ impl TryFrom<Request> for MeasurementBody {
             sequence: None,
             dark: asked.dark,
             warnings: Vec::new(),
+            reading: None,
         })
     }
 }

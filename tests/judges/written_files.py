@@ -13,8 +13,11 @@ import struct
 import sys
 import tarfile
 import zipfile
+import zlib
 
 import h5py
+import hdf5plugin
+import imagecodecs
 import imageio.v3 as imageio
 import numpy as np
 import OpenEXR
@@ -59,8 +62,17 @@ def level73(place):
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64 HDF5 schema 1.00 .".ljust(116) + b"\0" * 8 + b"\0\x02IM")
 
 
+def octave(place, name, values, kind):
+    """Writes a variable as Octave does: a group with its type and its value, whose axes are in reverse."""
+    with h5py.File(place, "w") as file:
+        group = file.create_group(name)
+        group.attrs["OCTAVE_NEW_FORMAT"] = np.uint8(1)
+        group.create_dataset("type", data=np.bytes_(kind))
+        group.create_dataset("value", data=np.ascontiguousarray(values.T))
+
+
 # A placeholder that `retag` turns into a tag that tifffile does not write.
-TAG = {"metadata": None, "software": False, "extratags": [(65000, 3, 1, 7, True)]}
+TAG = {"metadata": None, "software": False, "extratags": [(65000, 3, 1, 7, False)]}
 REVERSED = np.array([int(f"{byte:08b}"[::-1], 2) for byte in range(256)], "u1")
 
 
@@ -82,10 +94,34 @@ def retag(place, tag, value, change=None):
     place.write_bytes(data)
 
 
-def packed_tiff(place, values, bits):
-    """Writes samples of `bits` bits, most significant bit first, each row from a whole byte."""
+def packed(values, bits):
+    """Rows of samples of `bits` bits, most significant bit first, each from a whole byte."""
     digits = (values[..., None] >> np.arange(bits)[::-1]) & 1
-    rows = np.packbits(digits.reshape(*values.shape[:2], -1).astype("u1"), axis=-1)
+    return np.packbits(digits.reshape(*values.shape[:-1], -1).astype("u1"), axis=-1)
+
+
+def camera(values, packing):
+    """Packs two pixels of 12 bits into three bytes, as the standards of cameras describe."""
+    first, second = values[..., ::2], values[..., 1::2]
+    if packing == "mono12p":
+        three = [first & 255, first >> 8 | (second & 15) << 4, second >> 4]
+    else:
+        three = [first >> 4, first & 15 | (second & 15) << 4, second >> 4]
+    return np.stack(three, axis=-1).astype("u1").reshape(*values.shape[:-1], -1)
+
+
+def grey_png(place, values, bits):
+    """Writes a grey PNG of a bit depth that Pillow does not write."""
+    chunk = lambda name, data: struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    head = struct.pack(">IIBBBBB", values.shape[1], values.shape[0], bits, 0, 0, 0, 0)
+    rows = b"".join(b"\0" + row.tobytes() for row in packed(values, bits))
+    parts = [(b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    place.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts))
+
+
+def packed_tiff(place, values, bits):
+    """Writes a TIFF with samples of this many bits."""
+    rows = packed(values, bits)
     height, width = values.shape[1:]
     data = bytearray(b"II*\0\0\0\0\0")
     link = 4
@@ -133,7 +169,8 @@ def accepted():
     row = "npy"
     np.save(path(row, "a.npy"), MASKS.astype("f4"))
     np.save(path(row, "a.npy"), np.asfortranarray(MASKS.astype("f8")))
-    for code in ["?", "<i2", ">i4", "<i8", "u8", "i1", "<f2", ">f4"]:
+    # Integers that are all 0 or 1 mean closed and open.
+    for code in ["?", "u1", "<u2", "<i2", ">i4", "<i8", "u8", "i1", "<f2", ">f4"]:
         np.save(path(row, "a.npy"), MASKS.astype(code))
     np.save(path(row, "a.npy", axes="row-column-frame"), np.moveaxis(MASKS, 0, -1).astype("f4"))
     np.save(path(row, "a.npy", axes="column-row-frame"), MASKS.T.astype("f4"))
@@ -142,6 +179,14 @@ def accepted():
     # The masks have 48x64 pixels, so only one order fits.
     np.save(path(row, "a.npy", read_axes="row-column-frame", **snapshots), np.moveaxis(SNAPSHOTS, 0, -1).astype("u1"))
     np.save(path(row, "a.npy", read_axes="column-row-frame", **snapshots), SNAPSHOTS.T.astype("u1"))
+    row = "12-bit packed pixels, with `packing`"
+    for packing in ["mono12p", "mono12packed"]:
+        masks = camera(MASKS * 4095, packing)
+        np.save(path(row, "a.npy", packing=packing, read_axes="frame-row-column"), masks)
+        tifffile.imwrite(path(row, "a.tif", packing=packing), masks, photometric="minisblack")
+        shots = camera(SNAPSHOTS, packing)
+        np.save(path(row, "a.npy", packing=packing, read_axes="frame-row-column", **snapshots), shots)
+        path(row, "a.raw", packing=packing, **snapshots).write_bytes(shots.tobytes())
     row = "npz"
     np.savez(path(row, "a.npz"), MASKS.astype("f4"))
     np.savez_compressed(path(row, "a.npz"), mask=MASKS, meas=SNAPSHOTS)
@@ -224,11 +269,14 @@ def accepted():
         scipy.io.savemat(path(row, "a.mat"), {"meas": meas, "mask": mask.astype("f8")}, do_compression=packed)
     scipy.io.savemat(path(row, "a.mat", name="shots"), {"shots": mask.astype(bool)})
     scipy.io.savemat(path(row, "a.mat", measurement=True, full_scale=250), {"meas": meas.astype("u2")})
+    scipy.io.savemat(path(row, "a.mat", name="y", measurement=True), {"y": (meas / 250).astype("f4")})
+    scipy.io.savemat(path(row, "a.mat", name="C"), {"C": (mask * 255).astype("u1")})
     # At most 64 masks are allowed, and no sensor has 4 rows, so the frames must come first.
     scipy.io.savemat(path(row, "a.mat", read_axes="frame-row-column"), {"mask": MASKS.astype("u1")})
     row = "`.mat` level 7.3 (`save -v7.3`)"
     matlab73(path(row, "a.mat"), mask=(mask.astype("u1"), "logical"), meas=(meas.astype("f8"), "double"))
     matlab73(path(row, "a.mat", measurement=True, full_scale=250), meas=(meas.astype("u2"), "uint16"))
+    matlab73(path(row, "a.mat", name="y", measurement=True), y=(meas / 250, "double"))
     matlab73(path(row, "a.mat", axes="frame-row-column"), mask=(MASKS.astype("f4"), "single"))
     row = "HDF5"
     with h5py.File(path(row, "a.h5"), "w") as file:
@@ -237,6 +285,28 @@ def accepted():
         file.create_dataset("mask", data=MASKS.astype(">f4"), chunks=(1, 48, 64), compression="gzip", shuffle=True)
     with h5py.File(path(row, "a.h5", name="run/masks", axes="row-column-frame"), "w") as file:
         file.create_dataset("run/masks", data=mask.astype("<i4"), chunks=(16, 16, 2), fletcher32=True)
+    for arguments in [
+        {"compression": "lzf"},
+        {"compression": "lzf", "shuffle": True, "fletcher32": True},
+        {"compression": "szip"},
+        {"scaleoffset": 0},
+        hdf5plugin.LZ4(),
+        {**hdf5plugin.LZ4(nbytes=1024), "shuffle": True},
+    ]:
+        with h5py.File(path(row, "a.h5"), "w") as file:
+            file.create_dataset("mask", data=MASKS.astype("<u2"), chunks=(1, 48, 64), **arguments)
+    for size in [512, 1024, 65536]:
+        place = path(row, "a.h5")
+        with h5py.File(place, "w", userblock_size=size) as file:
+            file["mask"] = MASKS.astype("f4")
+        with place.open("r+b") as file:
+            file.write(b"a text in the user block")
+    row = "HDF5 of Octave (`save -hdf5`)"
+    octave(path(row, "a.h5", read_axes="row-column-frame"), "mask", mask.astype("f8"), "matrix")
+    octave(path(row, "a.h5", name="shots", read_axes="row-column-frame"), "shots", mask.astype("u1"), "bool matrix")
+    octave(path(row, "a.h5", name="shots/value", read_axes="row-column-frame"), "shots", mask.astype("i4"), "int32 matrix")
+    octave(path(row, "a.h5", read_axes="row-column-frame", **snapshots), "meas", meas.astype("<u2"), "uint16 matrix")
+    row = "HDF5"
     # MATLAB's h5write of [row, column, frame] reverses the axes and writes no class.
     with h5py.File(path(row, "a.h5", axes="frame-column-row"), "w") as file:
         file["mask"] = mask.astype("f8").T
@@ -262,11 +332,19 @@ def refused():
     np.savez(path(row, "in.npz", reason="missing_array", again={"name": "a"}), a=MASKS, b=SNAPSHOTS)
     row = "PNG with colour, transparency, or 2 or 4 bits"
     Image.fromarray(colours).save(path(row, "in.png", frames=1))
-    Image.fromarray(colours).convert("LA").save(path(row, "in.png", frames=1))
+    for mode in ["LA", "RGBA"]:
+        Image.fromarray(colours).convert(mode).save(path(row, "in.png", frames=1))
+    for channels in [2, 3, 4]:
+        sixteen = np.repeat((MASKS[0] * 65535).astype("u2")[..., None], channels, axis=2)
+        path(row, "in.png", frames=1).write_bytes(imagecodecs.png_encode(sixteen))
+    for bits in [2, 4]:
+        grey_png(path(row, "in.png", frames=1), MASKS[0] * (2**bits - 1), bits)
     Image.fromarray(EIGHT[0]).quantize(2).save(path(row, "in.png", frames=1))
     row = "animated PNG"
     pages = [Image.fromarray(frame) for frame in EIGHT]
     pages[0].save(path(row, "in.png"), save_all=True, append_images=pages[1:])
+    sixteen = [Image.fromarray((frame * 65535).astype("u2")) for frame in MASKS]
+    sixteen[0].save(path(row, "in.png"), save_all=True, append_images=sixteen[1:])
     row = "colour TIFF"
     tifffile.imwrite(path(row, "in.tif", frames=1), colours, photometric="rgb")
     four = np.repeat(EIGHT[..., None], 3, axis=3)
@@ -345,6 +423,10 @@ def refused():
     Image.fromarray(EIGHT[0]).save(path(row, "in.gif", frames=1), "bmp")
     row = "JPEG"
     pages[0].save(path(row, "in.jpg"))
+    row = "JPEG 2000"
+    for codec in ["jp2", "j2k"]:
+        data = imagecodecs.jpeg2k_encode((MASKS[0] * 65535).astype("u2"), level=0, codecformat=codec)
+        path(row, "in.jp2", frames=1).write_bytes(data)
     row = "gzip"
     place = path(row, "in.gz")
     with gzip.open(place, "wb") as file:
@@ -371,44 +453,57 @@ def refused():
     numbered = [(f"shot_{k}.png", png(frame)) for k, frame in enumerate(EIGHT)]
     zipped(path(row, "in.zip"), numbered, zipfile.ZIP_BZIP2)
     zipped(path(row, "in.zip"), numbered, zipfile.ZIP_LZMA)
+    # Lines of Python have the name of the array that was asked for.
+    for name in [None, "shots"]:
+        write_arrays(name or "mask", {"name": name} if name else {})
+    row = "HDF5 whose array is in a group"
+    with h5py.File(path(row, "in.h5", reason="missing_array", again={"name": "exchange/data"}), "w") as file:
+        file["exchange/data"], file["exchange/dark"] = MASKS.astype("f4"), MASKS[:1]
+    row = "`.mat` 7.3 with a struct"
+    with level73(path(row, "in.mat", reason="missing_array", again={"name": "mask/data"})) as file:
+        file.create_dataset("mask/data", data=np.moveaxis(MASKS, 0, -1).T).attrs["MATLAB_class"] = np.bytes_("double")
+        file["mask"].attrs["MATLAB_class"] = np.bytes_("struct")
+    row = "integers without a stated full scale"
+    np.save(path(row, "in.npy", measurement=True, reason="invalid_full_scale", again={"full_scale": 250}), SNAPSHOTS.astype("<i4"))
+
+
+def write_arrays(name, asked):
+    """Writes files whose array has this name."""
     mask = np.moveaxis(MASKS, 0, -1).astype("f8")
     row = "`.mat` with a sparse matrix"
-    scipy.io.savemat(path(row, "in.mat", frames=1), {"mask": scipy.sparse.csc_matrix(MASKS[0].astype("f8"))})
+    scipy.io.savemat(path(row, "in.mat", frames=1, **asked), {name: scipy.sparse.csc_matrix(MASKS[0].astype("f8"))})
     row = "`.mat` with complex numbers"
-    scipy.io.savemat(path(row, "in.mat"), {"mask": mask.astype("c16")})
+    scipy.io.savemat(path(row, "in.mat", **asked), {name: mask.astype("c16")})
+    scipy.io.savemat(path(row, "in.mat", frames=1, **asked), {name: MASKS[0].astype("c8")})
     row = "`.mat` with a cell array"
     cells = np.empty((1, 4), object)
     cells[0] = [frame.astype("f8") for frame in MASKS]
-    scipy.io.savemat(path(row, "in.mat"), {"mask": cells})
+    scipy.io.savemat(path(row, "in.mat", **asked), {name: cells})
     row = "`.mat` with a struct"
-    scipy.io.savemat(path(row, "in.mat"), {"mask": {"data": mask, "date": "today"}})
+    scipy.io.savemat(path(row, "in.mat", **asked), {name: {"data": mask, "date": "today"}})
+    scipy.io.savemat(path(row, "in.mat", frames=1, **asked), {name: {"date": "today", "data": MASKS[0].astype("f8")}})
     row = "`.mat` with more than three axes"
-    scipy.io.savemat(path(row, "in.mat"), {"mask": mask.reshape(48, 64, 2, 2, order="F")})
-    scipy.io.savemat(path(row, "in.mat"), {"mask": mask[:, :, None]})
+    scipy.io.savemat(path(row, "in.mat", **asked), {name: mask.reshape(48, 64, 2, 2, order="F")})
+    scipy.io.savemat(path(row, "in.mat", **asked), {name: mask[:, :, None]})
     row = "`.mat` 7.3 with a cell array"
-    with level73(path(row, "in.mat")) as file:
+    with level73(path(row, "in.mat", **asked)) as file:
         cells = [file.create_dataset(f"#refs#/{k}", data=frame.astype("f8").T).ref for k, frame in enumerate(MASKS)]
-        dataset = file.create_dataset("mask", data=np.array(cells, h5py.ref_dtype).reshape(4, 1))
+        dataset = file.create_dataset(name, data=np.array(cells, h5py.ref_dtype).reshape(4, 1))
         dataset.attrs["MATLAB_class"] = np.bytes_("cell")
-    row = "`.mat` 7.3 with a struct"
-    with level73(path(row, "in.mat")) as file:
-        file.create_dataset("mask/data", data=mask.T).attrs["MATLAB_class"] = np.bytes_("double")
-        file["mask"].attrs["MATLAB_class"] = np.bytes_("struct")
     row = "`.mat` 7.3 with more than three axes"
-    matlab73(path(row, "in.mat"), mask=(mask.reshape(48, 64, 2, 2, order="F"), "double"))
+    matlab73(path(row, "in.mat", **asked), **{name: (mask.reshape(48, 64, 2, 2, order="F"), "double")})
     row = "HDF5 with more than three axes"
-    with h5py.File(path(row, "in.h5"), "w") as file:
-        file["mask"] = MASKS.reshape(2, 2, 48, 64)
+    with h5py.File(path(row, "in.h5", **asked), "w") as file:
+        file[name] = MASKS.reshape(2, 2, 48, 64)
     row = "`.mat` level 4 (`save -v4`)"
-    scipy.io.savemat(path(row, "in.mat", frames=1), {"mask": MASKS[0].astype("f8")}, format="4")
-    row = "HDF5 with another filter (LZF, szip)"
-    with h5py.File(path(row, "in.h5"), "w") as file:
-        file.create_dataset("mask", data=MASKS, chunks=(1, 48, 64), compression="lzf")
+    scipy.io.savemat(path(row, "in.mat", frames=1, **asked), {name: MASKS[0].astype("f8")}, format="4")
+    row = "HDF5 with another filter (Blosc, bitshuffle, Zstandard)"
+    for plugin in [hdf5plugin.Blosc(), hdf5plugin.Bitshuffle(), hdf5plugin.Zstd()]:
+        with h5py.File(path(row, "in.h5", **asked), "w") as file:
+            file.create_dataset(name, data=MASKS, chunks=(1, 48, 64), **plugin)
     row = "HDF5 with records or complex numbers"
-    with h5py.File(path(row, "in.h5"), "w") as file:
-        file["mask"] = MASKS.astype("c8")
-    row = "integers without a stated full scale"
-    np.save(path(row, "in.npy", measurement=True, reason="invalid_full_scale", again={"full_scale": 250}), SNAPSHOTS.astype("<i4"))
+    with h5py.File(path(row, "in.h5", **asked), "w") as file:
+        file[name] = MASKS.astype("c8")
 
 
 accepted()

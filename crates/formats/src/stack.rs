@@ -121,7 +121,7 @@ pub struct StackInfo {
     /// The full scale if none is stated: [`SampleType::default_full_scale`], except for .mat scenes, where it is
     /// [`SceneArray::default_full_scale`](super::mat::SceneArray::default_full_scale).
     pub default_full_scale: Option<FullScale>,
-    /// The largest value that a camera can have stored, if the file shows it: that of unsigned integers of up to 16 bits.
+    /// The largest value that a camera can have stored, for unsigned integers of up to 16 bits.
     pub largest: Option<f32>,
 }
 

@@ -10,12 +10,12 @@ use super::model_process::ModelCommand;
 use super::transport::{Check, TaskError};
 use engine::intake::{self, Exposure, IntakeError, Refusal, RefusalCode, Source, plan};
 use engine::job::{
-    CalibrationRequest, Captures, Label, MeasurementRequest, ModelRequest, Mosaic, Sequence,
-    Sha256, Submission, TaskStage,
+    CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Sequence, Sha256,
+    Submission, TaskStage, keeps_mosaic,
 };
 use engine::pipeline::progress::Monitor;
 use formats::mat::SceneArray;
-use formats::{Axes, FormatError, Limits, StackInfo, StackWriter, planar};
+use formats::{FormatError, Limits, Part, StackInfo, StackWriter, planar};
 use store::{BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, StoreError};
 
 /// Why a check has no good end.
@@ -115,19 +115,6 @@ impl Desk<'_> {
         })
     }
 
-    /// The path of an upload, opened as a stack.
-    fn open(
-        &self,
-        file: &std::path::Path,
-        array: SceneArray,
-        (named, axes, full_scale): (Option<&Label>, Option<Axes>, Option<f32>),
-        size: Option<(usize, usize)>,
-    ) -> Result<intake::Opened> {
-        let source = Source::upload(file, array, full_scale, self.limits());
-        let source = source.named(named.map(ToString::to_string)).arranged(axes, size);
-        Ok(source.open()?)
-    }
-
     /// Notes which share is read, on \[0,1\], and ends a check that was stopped or takes too long.
     fn go_on(&self, share: f64) -> Result<(), FormatError> {
         self.monitor.reach(TaskStage::Reading, share);
@@ -171,13 +158,18 @@ impl Desk<'_> {
 
     /// Checks masks and writes them on \[0,1\].
     fn masks(&self, request: &CalibrationRequest) -> Result<Checked> {
-        let CalibrationRequest { name, array, axes, full_scale, mosaic, .. } = request.clone();
+        let CalibrationRequest {
+            name, array, axes, crop, frames, packing, full_scale, mosaic, ..
+        } = request.clone();
         let wrong = || Refusal::new(RefusalCode::InvalidRequest, "name the masks").at("/masks");
         let masks = request.masks.ok_or_else(wrong)?;
         let file = self.upload(masks, "/masks")?;
-        let opened =
-            self.open(&file, SceneArray::Masks, (array.as_ref(), axes, full_scale), None)?;
-        let (info, full_scale) = (opened.info, opened.full_scale.value());
+        let source = Source::upload(&file, SceneArray::Masks, full_scale, self.limits())
+            .named(array.map(|name| name.to_string()))
+            .arranged(axes, None)
+            .part(Part { crop, frames }, packing);
+        let opened = source.open()?;
+        let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         let mut writer = self.writer(&info)?;
         let mut done = 0.0;
         let found = intake::masks(opened, |mask| {
@@ -200,6 +192,7 @@ impl Desk<'_> {
             dead_pixels: found.dead_pixels,
             clipped_negatives: found.clipped_negative,
             mosaic,
+            reading: Some(reading),
         };
         Ok(Checked::Masks(facts, writer.finish()?.finish()?))
     }
@@ -218,13 +211,20 @@ impl Desk<'_> {
             dark.push(self.upload(*upload, &format!("/dark/{index}"))?);
         }
         let (masks, limits) = (&calibration.facts, self.limits());
-        let how = (request.array.as_ref(), request.axes, request.full_scale);
-        let size = Some((masks.height, masks.width));
-        let opened = self.open(&file, SceneArray::Measurements, how, size)?;
-        let (info, full_scale) = (opened.info, opened.full_scale.value());
+        if masks.mosaic.is_some() && !keeps_mosaic(request.crop) {
+            let detail = "the window of a mosaic starts at an even row and an even column";
+            return Err(Refusal::new(RefusalCode::InvalidRequest, detail).at("/crop").into());
+        }
+        let source = Source::upload(&file, SceneArray::Measurements, request.full_scale, limits)
+            .named(request.array.map(|name| name.to_string()))
+            .arranged(request.axes, Some((masks.height, masks.width)))
+            .part(Part { crop: request.crop, frames: None }, request.packing);
+        let opened = source.open()?;
+        let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         if (info.height, info.width) != (masks.height, masks.width) {
             let detail = format!(
-                "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}",
+                "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}: state the window \
+                 that both have in common as `crop`, with the calibration if the masks are larger",
                 info.height, info.width, calibration.id, masks.height, masks.width
             );
             return Err(Refusal::new(RefusalCode::SizeMismatch, detail).at("/data").into());
@@ -262,6 +262,7 @@ impl Desk<'_> {
             sequence: request.sequence.unwrap_or(by_times),
             dark: request.dark,
             warnings,
+            reading,
         };
         Ok(Checked::Measurement(facts, staged))
     }

@@ -169,6 +169,7 @@ fn facts(made: &Calibrated, masks: Sha256) -> NewCalibration {
         dead_pixels: report.masks.dead_pixels,
         clipped_negatives: made.clipped_negatives,
         mosaic: None,
+        reading: None,
     }
 }
 

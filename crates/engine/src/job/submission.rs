@@ -2,8 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::reading::keeps_mosaic;
 use super::{CalibrationId, Captures, InvalidField, Label, Mosaic, Sequence, Sha256};
-use formats::{Axes, FullScale};
+use formats::{Axes, Crop, FullScale, Packing};
 
 /// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
 const CHECK_S: f64 = 20e-9;
@@ -23,6 +24,15 @@ pub struct CalibrationRequest {
     /// Order of the array's axes; without it, the only one that fits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
+    /// Window of each mask; by default the whole masks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub crop: Option<Crop>,
+    /// First and last mask, both included, counted from 0; by default all masks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frames: Option<(usize, usize)>,
+    /// How the pixels are packed; by default one number per pixel.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub packing: Option<Packing>,
     pub full_scale: Option<f32>,
     pub captures: Option<Captures>,
     /// Colours of the sensor's pixels; a grey sensor has none.
@@ -43,6 +53,12 @@ pub struct MeasurementRequest {
     /// Order of the array's axes; without it, the only one that fits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
+    /// Window of each snapshot and dark frame; by default whole snapshots.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub crop: Option<Crop>,
+    /// How the pixels of data and dark frames are packed; by default one number per pixel.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub packing: Option<Packing>,
     /// Captures with the LCoS all black, at the measurement's exposure. Their average is subtracted.
     #[serde(default)]
     pub dark: Vec<Sha256>,
@@ -159,12 +175,24 @@ impl CalibrationRequest {
     fn check(&self) -> Result<(), Vec<InvalidField>> {
         let wrong = |pointer: &str, detail: &str| Err(vec![InvalidField::new(pointer, detail)]);
         match (&self.masks, &self.captures) {
+            (Some(_), None) if self.mosaic.is_some() && !keeps_mosaic(self.crop) => {
+                wrong("/crop", "the window of a mosaic starts at an even row and an even column")
+            }
             (Some(_), None) => Ok(()),
             (None, Some(_)) if self.array.is_some() => {
                 wrong("/array", "captures are pictures, not named arrays")
             }
             (None, Some(_)) if self.axes.is_some() => {
                 wrong("/axes", "captures are [frame, row, column]: leave axes out")
+            }
+            (None, Some(_)) if self.crop.is_some() => {
+                wrong("/crop", "captures are used as a whole: crop the files")
+            }
+            (None, Some(_)) if self.frames.is_some() => {
+                wrong("/frames", "captures are used as a whole: list the files that are needed")
+            }
+            (None, Some(_)) if self.packing.is_some() => {
+                wrong("/packing", "captures have one number per pixel")
             }
             (None, Some(_)) if self.full_scale.is_some() => wrong(
                 "/full_scale",
@@ -185,6 +213,8 @@ impl MeasurementRequest {
             data,
             array: None,
             axes: None,
+            crop: None,
+            packing: None,
             dark: Vec::new(),
             saturation: None,
             full_scale: None,
