@@ -162,6 +162,7 @@ CREATE TABLE calibrations (
     clipped_negatives INTEGER NOT NULL,
     -- The colours of a cell of 2x2 pixels, row by row; NULL for a grey sensor.
     mosaic            TEXT CHECK (mosaic IN ('rggb', 'bggr', 'grbg', 'gbrg')),
+    reading           TEXT, -- how the masks' file was read, as JSON; NULL for captures
     created_at        INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 
@@ -203,6 +204,7 @@ CREATE TABLE measurements (
     sequence    TEXT NOT NULL CHECK (sequence IN ('contiguous', 'separate')),
     dark        TEXT, -- uploads that were subtracted, as JSON
     warnings    TEXT, -- findings of the check, as JSON
+    reading     TEXT NOT NULL, -- how the file was read, as JSON
     created_at  INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 

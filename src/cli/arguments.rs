@@ -12,7 +12,7 @@ use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
 use engine::job::{Algorithm, InvalidField, Mosaic, Sequence};
 use engine::pipeline::NetworkSource;
-use formats::Axes;
+use formats::{Axes, Packing};
 use reconstruction::priors::onnx::Device;
 use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
@@ -165,6 +165,21 @@ pub(super) fn sequence() -> impl TypedValueParser<Value = Sequence> {
 /// Parses an order of axes.
 pub(super) fn axes() -> impl TypedValueParser<Value = Axes> {
     PossibleValuesParser::new(Axes::VARIANTS).try_map(|name: String| name.parse::<Axes>())
+}
+
+/// Parses packings of pixels.
+pub(super) fn packing() -> impl TypedValueParser<Value = Packing> {
+    PossibleValuesParser::new(Packing::VARIANTS).try_map(|name: String| name.parse::<Packing>())
+}
+
+/// Parses `FIRST-LAST`: first and last frame, both included, counted from 0.
+pub(super) fn frame_range(text: &str) -> Result<(usize, usize), String> {
+    match text.parse::<Snapshots>()? {
+        Snapshots { first, last: Some(last) } => Ok((first, last)),
+        Snapshots { last: None, .. } => {
+            Err("name one index, or FIRST-LAST with both ends in".to_owned())
+        }
+    }
 }
 
 /// Parses names of all algorithms.

@@ -12,14 +12,18 @@ use ndarray::{Array2, Array3, ArrayView3};
 use serde::Serialize;
 
 use super::CliError;
-use super::arguments::{NetworkArguments, ScheduleArguments, Snapshots, axes, mosaic, sequence};
+use super::arguments::{
+    NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic, packing, sequence,
+};
 use super::model::{Model, cut};
 use super::output::print_line;
 use super::progress::SnapshotBar;
 use super::verdict;
 use crate::cli::error::Result;
 use engine::intake::{self, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth};
-use engine::job::{Algorithm, Assessment, Finding, Mosaic, SceneShape, Schedule, Sequence, Sha256};
+use engine::job::{
+    Algorithm, Assessment, Finding, Mosaic, SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
+};
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
@@ -30,7 +34,7 @@ use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{check_output, replace_result, write_result};
 use formats::mat::SceneArray;
-use formats::{Axes, Channels, Limits, planar};
+use formats::{Axes, Channels, Crop, Limits, Packing, Part, planar};
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::TilePlan;
 
@@ -82,6 +86,21 @@ pub struct Arguments {
     /// The order of the axes in the masks' file [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     masks_axes: Option<Axes>,
+    /// Window of each mask: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole masks].
+    #[arg(long, value_name = "WINDOW")]
+    masks_crop: Option<Crop>,
+    /// First and last mask, both included, counted from 0 [default: all masks].
+    #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
+    masks_frames: Option<(usize, usize)>,
+    /// How the pixels of the masks are packed [default: one number per pixel].
+    #[arg(long, value_name = "NAME", value_parser = packing())]
+    masks_packing: Option<Packing>,
+    /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
+    #[arg(long, value_name = "WINDOW")]
+    measurement_crop: Option<Crop>,
+    /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
+    #[arg(long, value_name = "NAME", value_parser = packing())]
+    measurement_packing: Option<Packing>,
     /// The order of the axes in the measurement's file.
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     measurement_axes: Option<Axes>,
@@ -259,13 +278,21 @@ impl<'a> Sources<'a> {
                 SceneArray::Masks,
                 arguments.masks_full_scale,
             )
-            .arranged(arguments.masks_axes, None),
+            .arranged(arguments.masks_axes, None)
+            .part(
+                Part { crop: arguments.masks_crop, frames: arguments.masks_frames },
+                arguments.masks_packing,
+            ),
             measurement: Source::file(
                 named(&arguments.measurement).ok_or_else(missing)?,
                 SceneArray::Measurements,
                 arguments.measurement_full_scale,
             )
-            .arranged(arguments.measurement_axes, None),
+            .arranged(arguments.measurement_axes, None)
+            .part(
+                Part { crop: arguments.measurement_crop, frames: None },
+                arguments.measurement_packing,
+            ),
             truth: named(&arguments.truth).map(|path| {
                 Source::file(path, SceneArray::Truth, arguments.truth_full_scale)
                     .arranged(arguments.truth_axes, None)
@@ -309,12 +336,18 @@ impl<'a> Input<'a> {
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
                 "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
-                 {height}x{width}; both must have the same height and width",
+                 {height}x{width}; both must have the same height and width: state the window that they have in \
+                 common as --masks-crop or --measurement-crop",
                 sources.measurement.path.display(),
                 sources.masks.path.display(),
             )));
         }
         let mosaic = arguments.mosaic;
+        let crops = [arguments.masks_crop, arguments.measurement_crop];
+        if mosaic.is_some() && !crops.into_iter().all(keeps_mosaic) {
+            let text = "--mosaic: the window of a mosaic starts at an even row and an even column";
+            return Err(CliError::Input(text.into()));
+        }
         if mosaic.is_some() && !(height.is_multiple_of(2) && width.is_multiple_of(2)) {
             return Err(CliError::Input(format!(
                 "--mosaic: the pictures are {height}x{width} (rows x columns); a mosaic has an even number of \

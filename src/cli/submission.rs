@@ -6,10 +6,10 @@ use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::CliError;
-use super::arguments::{Snapshots, axes, mosaic, named_all, sequence};
+use super::arguments::{Snapshots, axes, frame_range, mosaic, named_all, packing, sequence};
 use super::client::{Client, Result};
 use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
-use formats::Axes;
+use formats::{Axes, Crop, Packing};
 
 /// Options of the calibration, the measurement and the job.
 #[derive(Debug, Args)]
@@ -27,6 +27,17 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "ORDER", conflicts_with = "calibration", value_parser = axes(),
           help_heading = CALIBRATION)]
     masks_axes: Option<Axes>,
+    /// Window of each mask: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole masks].
+    #[arg(long, value_name = "WINDOW", conflicts_with = "calibration", help_heading = CALIBRATION)]
+    masks_crop: Option<Crop>,
+    /// First and last mask, both included, counted from 0 [default: all masks].
+    #[arg(long, value_name = "FIRST-LAST", conflicts_with = "calibration", value_parser = frame_range,
+          help_heading = CALIBRATION)]
+    masks_frames: Option<(usize, usize)>,
+    /// How the pixels of the masks are packed [default: one number per pixel].
+    #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = packing(),
+          help_heading = CALIBRATION)]
+    masks_packing: Option<Packing>,
     /// The stored number in the masks that means 1, fully open [default: that of their type].
     #[arg(long, value_name = "NUMBER", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_full_scale: Option<f64>,
@@ -43,6 +54,12 @@ pub(super) struct SubmissionArguments {
     /// The order of the axes of the snapshots [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes(), help_heading = MEASUREMENT)]
     axes: Option<Axes>,
+    /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
+    #[arg(long, value_name = "WINDOW", help_heading = MEASUREMENT)]
+    crop: Option<Crop>,
+    /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
+    #[arg(long, value_name = "NAME", value_parser = packing(), help_heading = MEASUREMENT)]
+    packing: Option<Packing>,
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE", help_heading = MEASUREMENT)]
     dark: Vec<PathBuf>,
@@ -143,6 +160,9 @@ impl SubmissionArguments {
         let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
         add(&mut body, "array", json!(self.masks_array));
         add(&mut body, "axes", json!(self.masks_axes));
+        add(&mut body, "crop", json!(self.masks_crop));
+        add(&mut body, "frames", json!(self.masks_frames));
+        add(&mut body, "packing", json!(self.masks_packing));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         add(&mut body, "mosaic", json!(self.mosaic));
         add(&mut body, "name", json!(self.masks_name));
@@ -154,6 +174,8 @@ impl SubmissionArguments {
         let mut body = Map::from_iter([("calibration".to_owned(), json!(calibration))]);
         add(&mut body, "array", json!(self.array));
         add(&mut body, "axes", json!(self.axes));
+        add(&mut body, "crop", json!(self.crop));
+        add(&mut body, "packing", json!(self.packing));
         add(&mut body, "dark", if dark.is_empty() { Value::Null } else { json!(dark) });
         add(&mut body, "saturation", json!(self.saturation));
         add(&mut body, "full_scale", json!(self.full_scale));
@@ -258,11 +280,16 @@ mod tests {
             ("masks", "m.npy"),
             ("masks-array", "mask"),
             ("masks-axes", "frame-row-column"),
+            ("masks-crop", "0,8,64,64"),
+            ("masks-frames", "4-11"),
+            ("masks-packing", "mono12p"),
             ("masks-full-scale", "255"),
             ("masks-name", "May"),
             ("mosaic", "rggb"),
             ("array", "meas"),
             ("axes", "row-column-frame"),
+            ("crop", "0,8,64,64"),
+            ("packing", "mono12packed"),
             ("dark", "d.npy"),
             ("saturation", "4095"),
             ("full-scale", "4095"),

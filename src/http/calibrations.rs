@@ -11,7 +11,7 @@ use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody, Renaming};
 use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
-    CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Sha256, Submission, Timestamp,
+    CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Reading, Sha256, Submission, Timestamp,
 };
 use store::{Asked, Calibration, Filter, Made, Page, Request, Span};
 
@@ -61,6 +61,7 @@ pub(super) struct CalibrationBody {
     clipped_negatives: Option<u64>,
     /// Colours of the pixels of the sensor; null for a grey sensor.
     mosaic: Option<Mosaic>,
+    reading: Option<Reading>,
 }
 
 impl From<Calibration> for CalibrationBody {
@@ -86,6 +87,7 @@ impl From<Calibration> for CalibrationBody {
             dead_pixels: Some(facts.dead_pixels),
             clipped_negatives: Some(facts.clipped_negatives),
             mosaic: facts.mosaic,
+            reading: facts.reading,
         }
     }
 }
@@ -119,6 +121,7 @@ impl From<Request> for CalibrationBody {
             dead_pixels: None,
             clipped_negatives: None,
             mosaic,
+            reading: None,
         }
     }
 }

@@ -11,8 +11,8 @@ use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{ListQuery, NoQuery, PageBody, Renaming};
 use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
-    CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Sequence, Sha256,
-    Submission, Timestamp,
+    CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Reading, Sequence,
+    Sha256, Submission, Timestamp,
 };
 use store::{Asked, Made, Measurement, Page, Request, StoreError};
 
@@ -49,6 +49,7 @@ pub(super) struct MeasurementBody {
     dark: Vec<Sha256>,
     /// Findings of the check against the calibration. Every job of the measurement repeats them.
     warnings: Vec<Finding>,
+    reading: Option<Reading>,
 }
 
 impl From<Measurement> for MeasurementBody {
@@ -74,6 +75,7 @@ impl From<Measurement> for MeasurementBody {
             sequence: Some(facts.sequence),
             dark: facts.dark,
             warnings: facts.warnings,
+            reading: Some(facts.reading),
         }
     }
 }
@@ -109,6 +111,7 @@ impl TryFrom<Request> for MeasurementBody {
             sequence: None,
             dark: asked.dark,
             warnings: Vec::new(),
+            reading: None,
         })
     }
 }

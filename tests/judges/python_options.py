@@ -10,7 +10,7 @@ import sys
 from sci_recon import Client
 from sci_recon.__main__ import options, parser
 
-PREFIXED = {"array": "masks_array", "axes": "masks_axes", "full_scale": "masks_full_scale", "name": "masks_name"}
+PREFIXED = {name: f"masks_{name}" for name in ["array", "axes", "crop", "frames", "packing", "full_scale", "name"]}
 
 
 def keywords(method):

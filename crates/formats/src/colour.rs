@@ -11,7 +11,7 @@ use crate::error::Result;
 ///
 /// Errors: as [`super::open_stack`].
 pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Box<dyn FrameReader + Send>>> {
-    let (file, length, format) = open(path)?;
+    let (file, length, format) = open(path, "mask")?;
     limits.check_file(format, length)?;
     Ok(match format {
         Format::Npy => {

@@ -39,7 +39,10 @@ pub enum FormatError {
     #[error("the {format} file is too large: {what} is {value}, but the limit is {limit}")]
     OverLimit { format: Format, what: &'static str, value: u64, limit: u64 },
     /// The file does not have the requested array.
-    #[error("the {format} file has no array named '{name}'; it contains {present}")]
+    #[error(
+        "the {format} file has no array named '{name}'; it contains {present}{}",
+        if present.starts_with('\'') { ": name one of them as `array`" } else { "" }
+    )]
     MissingArray { format: Format, name: String, present: String },
     /// A picture of an archive is not a valid frame.
     #[error("{name}: {source}")]
@@ -57,6 +60,9 @@ pub enum FormatError {
     /// An order of axes was stated for pictures, whose order is fixed.
     #[error("a {0} file contains pictures, which always have rows and columns: omit `axes`")]
     NoAxes(Format),
+    /// A stated part or packing does not fit the file.
+    #[error("{field}: {detail}")]
+    Part { field: &'static str, detail: String },
     /// The data type has no default full scale, and none was stated.
     #[error(
         "the samples are {0}, which has no default full scale: state `full_scale`, the stored value that means 1"
@@ -77,6 +83,14 @@ pub enum FormatError {
          full scale {full_scale}: state as `full_scale` the stored value that means fully open"
     )]
     AboveFullScale { largest: f32, frame: usize, row: usize, column: usize, full_scale: f32 },
+    /// The masks have positive and negative levels.
+    #[error(
+        "masks: {percent} % of the values other than 0 are negative, {low} on average, and the others are {high} on \
+         average; a mask transmits light or blocks it, so its values lie between 0 and the full scale. If the pattern \
+         (1+C)/2 was shown for a mask C, send (1+C)/2. If the measurement is the difference of two exposures, behind \
+         (1+C)/2 and behind (1-C)/2, send each exposure as a measurement with the masks it was taken with"
+    )]
+    BipolarMasks { percent: f64, low: f32, high: f32 },
     /// All masks are closed everywhere.
     #[error("masks: no value is above 0 in any of the {frames} frames; masks need open pixels")]
     AllMasksZero { frames: usize },
@@ -128,9 +142,11 @@ impl FormatError {
             Self::Member { source, .. } => source.code(),
             Self::AxesAmbiguous { .. } => "axes_ambiguous",
             Self::NoAxes(_) => "no_axes",
+            Self::Part { .. } => "invalid_part",
             Self::FullScale(_) | Self::FullScaleNeeded(_) => "invalid_full_scale",
             Self::NotFinite { .. } => "not_finite",
             Self::AboveFullScale { .. } => "above_full_scale",
+            Self::BipolarMasks { .. } => "bipolar_masks",
             Self::AllMasksZero { .. } => "all_masks_zero",
             Self::MaskFrameZero { .. } => "mask_frame_zero",
             Self::SnapshotZero { .. } => "snapshot_zero",

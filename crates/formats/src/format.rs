@@ -4,8 +4,8 @@ use strum::Display;
 
 /// Signature of npy files.
 pub(super) const NPY_MAGIC: &[u8] = b"\x93NUMPY";
-/// Signature of HDF5 files without a user block.
-const HDF5_MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
+/// Signature of HDF5 files. It follows a user block, if there is one.
+pub(super) const HDF5_MAGIC: &[u8] = b"\x89HDF\r\n\x1a\n";
 /// Signature of prepared arrays.
 pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 
@@ -13,6 +13,9 @@ pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 pub(super) const HEAD_BYTES: u64 = 512;
 /// Offset and start of the signature of a tar archive.
 const TAR_MAGIC: (usize, &[u8]) = (257, b"ustar");
+
+/// Signatures of JPEG 2000, as a file and as a stream.
+const JPEG_2000: [&[u8]; 2] = [b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51"];
 
 /// A file format that this crate reads or writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Display)]
@@ -44,6 +47,9 @@ pub enum Format {
     /// OpenEXR.
     #[strum(serialize = "EXR")]
     Exr,
+    /// Packed pixels of a camera without a header.
+    #[strum(serialize = "raw")]
+    Raw,
     /// Prepared array of this program ([`super::planar`]).
     #[strum(serialize = "planar")]
     Planar,
@@ -82,8 +88,8 @@ impl Format {
     }
 }
 
-/// Describes a file of an unsupported format by its first bytes.
-pub(super) fn describe(head: &[u8]) -> String {
+/// Describes a file of an unsupported format by its first bytes. `name` is that of the array in a line of Python.
+pub(super) fn describe(head: &[u8], name: &str) -> String {
     if head.starts_with(b"\x1f\x8b") {
         return "it is compressed with gzip (to decompress it: python -c \"import gzip, shutil; \
                 shutil.copyfileobj(gzip.open('in.gz'), open('out', 'wb'))\")"
@@ -99,10 +105,16 @@ pub(super) fn describe(head: &[u8]) -> String {
         return "it is a JPEG, which is lossy: save the pictures as PNG, TIFF or npy instead"
             .to_owned();
     }
-    if is_level_4(head) {
-        return "it is a MATLAB level 4 file (to convert it: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
-                scipy.io.loadmat('in.mat')['mask'])\")"
+    if JPEG_2000.iter().any(|magic| head.starts_with(magic)) {
+        return "it is a JPEG 2000 (to convert it: python -c \"import imagecodecs, numpy; numpy.save('out.npy', \
+                imagecodecs.imread('in.jp2'))\")"
             .to_owned();
+    }
+    if is_level_4(head) {
+        return format!(
+            "it is a MATLAB level 4 file (to convert it: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
+             scipy.io.loadmat('in.mat')['{name}'])\")"
+        );
     }
     let start: Vec<String> = head.iter().take(8).map(|b| format!("{b:02x}")).collect();
     format!("it starts with the bytes {}", start.join(" "))

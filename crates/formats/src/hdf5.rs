@@ -7,14 +7,19 @@
 //! external files, so an upload could read files of the server. Ranges are read and not mapped, so a file that is
 //! truncated while it is read gives an error and not a signal.
 
+mod lz4;
+mod lzf;
+
+use std::collections::HashSet;
 use std::fs::File;
 use std::sync::Arc;
 
 use hdf5_reader::error::Error;
+use hdf5_reader::group::Group;
 use hdf5_reader::storage::{DynStorage, FileStorage};
 use hdf5_reader::{
-    ByteOrder as StoredOrder, Dataset, Datatype, H5Type, Hdf5File, OpenOptions, SliceInfo,
-    SliceInfoElem,
+    ByteOrder as StoredOrder, Dataset, Datatype, FilterRegistry, H5Type, Hdf5File, OpenOptions,
+    SliceInfo, SliceInfoElem,
 };
 
 use super::array::{self, ArrayReader, Samples};
@@ -36,7 +41,20 @@ struct Hdf5Samples {
     /// Index of the next entry.
     next: u64,
     is_bool: bool,
+    advice: Advice,
 }
+
+/// Makes errors with lines of Python that convert the array.
+#[derive(Debug, Clone)]
+struct Advice {
+    /// The path of the array for a line of Python.
+    name: String,
+}
+
+/// Largest depth of groups, and largest numbers of groups and arrays, that are listed in an error.
+const MAX_DEPTH: usize = 16;
+const MAX_GROUPS: usize = 256;
+const MAX_LISTED: usize = 1024;
 
 /// Opens the array with this name; `array` is its role. Errors: malformed files; [`FormatError::MissingArray`];
 /// [`FormatError::OverLimit`]; [`FormatError::Unsupported`]; [`FormatError::AxesAmbiguous`].
@@ -45,46 +63,52 @@ pub(super) fn open(
     (array, name, expected): (SceneArray, &str, &Expected),
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
+    let mut advice = Advice { name: python_name(name) };
+    let error = |source| advice.error(source);
     let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
+    let mut filters = FilterRegistry::new();
+    let max_bytes = CHUNK_CACHE_BYTES;
+    filters.register(
+        lzf::FILTER,
+        Box::new(move |filter, bytes, _| lzf::decompress(bytes, &filter.client_data, max_bytes)),
+    );
+    filters.register(lz4::FILTER, Box::new(move |_, bytes, _| lz4::decompress(bytes, max_bytes)));
     let options = OpenOptions {
         chunk_cache_bytes: CHUNK_CACHE_BYTES,
         max_chunk_bytes: CHUNK_CACHE_BYTES,
+        filter_registry: Some(filters),
         ..OpenOptions::default()
     };
     let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
-    let (groups, names) = file.root_group().and_then(|root| root.member_names()).map_err(error)?;
-    let dataset = match file.dataset(name) {
-        Ok(dataset) => dataset,
-        Err(Error::Io(source)) => return Err(error(Error::Io(source))),
-        Err(other) if names.iter().any(|present| present == name) => {
-            return Err(error(other));
-        }
-        Err(_) if groups.iter().any(|present| present == name) => {
-            return Err(unsupported(GROUP.to_owned()));
-        }
-        Err(_) => {
-            let (format, name) = (Format::Hdf5, name.to_owned());
-            return Err(FormatError::MissingArray { format, name, present: list(&names) });
-        }
-    };
+    let root = file.root_group().map_err(error)?;
+    let Found { dataset, octave } = find(&root, name).map_err(error)?.ok_or_else(|| {
+        let (format, name) = (Format::Hdf5, name.to_owned());
+        FormatError::MissingArray { format, name, present: list(&array_paths(&root)) }
+    })?;
+    if octave.is_some() && !name.ends_with("/value") {
+        advice.name = python_name(&format!("{name}/value"));
+    }
+    let error = |source| advice.error(source);
     let class = dataset.attribute("MATLAB_class").ok();
     let class = class.map(|class| class.read_string().map_err(error)).transpose()?;
+    let is_bool = class.as_deref() == Some("logical")
+        || octave.as_ref().is_some_and(|kind| kind.starts_with("bool"));
     let sample = match (sample_type(dataset.dtype()), class.as_deref()) {
-        (Some((SampleType::U8, _)), Some("logical")) => SampleType::Bool,
         (Some(_), Some("char")) => return Err(unsupported("text".to_owned())),
+        (Some(_), _) if is_bool => SampleType::Bool,
         (Some((sample, _)), _) => sample,
-        (None, _) => return Err(unsupported(describe(dataset.dtype()))),
+        (None, _) => return Err(unsupported(advice.describe(dataset.dtype()))),
     };
     let mut shape = dataset.shape().to_vec();
-    let writer = if class.is_some() { Writer::Matlab } else { Writer::Rows };
+    let writer = if class.is_some() || octave.is_some() { Writer::Matlab } else { Writer::Rows };
     if writer == Writer::Matlab {
         shape.reverse();
     }
     let arranged = expected.arrange((Format::Hdf5, writer), &shape)?;
-    let arranged = arranged.ok_or_else(|| many_axes(shape.len(), writer))?;
+    let arranged = arranged.ok_or_else(|| advice.many_axes(shape.len(), writer))?;
     let mut info = array::info(Format::Hdf5, sample, &arranged, limits)?;
     check_chunks(&dataset, sample)?;
-    if writer == Writer::Matlab {
+    if writer == Writer::Matlab && name == array.name() {
         info.default_full_scale = Some(array.default_full_scale());
     }
     let entries = match *dataset.shape() {
@@ -93,8 +117,76 @@ pub(super) fn open(
     };
     let entry_samples = info.frames * info.height * info.width / entries;
     let is_bool = sample == SampleType::Bool;
-    let samples = Hdf5Samples { dataset, entry_samples, next: 0, is_bool };
+    let samples = Hdf5Samples { dataset, entry_samples, next: 0, is_bool, advice };
     Ok(Box::new(ArrayReader::new(samples, info, arranged.layout)))
+}
+
+/// An array of a file.
+struct Found {
+    dataset: Dataset,
+    /// The type of the variable in files of Octave; `None` in other files.
+    octave: Option<String>,
+}
+
+/// Finds the array at a path. Octave stores a variable as a group with the arrays `type` and `value`; the path of the
+/// group stands for its value. `None` if there is no array at this path. Errors: those of reading the array.
+fn find(root: &Group, path: &str) -> Result<Option<Found>, Error> {
+    let mut parent = None;
+    let mut group = None;
+    let mut parts = path.split('/').filter(|part| !part.is_empty()).peekable();
+    while let Some(part) = parts.next() {
+        let current = group.take().unwrap_or_else(|| root.clone());
+        let (groups, arrays) = current.member_names()?;
+        if parts.peek().is_none() && arrays.iter().any(|name| name == part) {
+            let octave = if part == "value" { octave_type(&current) } else { None };
+            return Ok(Some(Found { dataset: current.dataset(part)?, octave }));
+        }
+        if !groups.iter().any(|name| name == part) {
+            return Ok(None);
+        }
+        group = Some(current.group(part)?);
+        parent = Some(());
+    }
+    let (Some(group), Some(())) = (group, parent) else { return Ok(None) };
+    let Some(octave) = octave_type(&group) else { return Ok(None) };
+    match group.member_names()?.1.iter().any(|name| name == "value") {
+        true => Ok(Some(Found { dataset: group.dataset("value")?, octave: Some(octave) })),
+        false => Ok(None),
+    }
+}
+
+/// The type of the variable that Octave stores in a group.
+fn octave_type(group: &Group) -> Option<String> {
+    group.dataset("type").ok()?.read_string().ok()
+}
+
+/// The paths of the arrays of a file, up to some limits. Groups that MATLAB uses internally are left out.
+fn array_paths(root: &Group) -> Vec<String> {
+    let (mut paths, mut seen) = (Vec::new(), HashSet::new());
+    let mut waiting = vec![(String::new(), 0, root.clone())];
+    while let Some((prefix, depth, group)) = waiting.pop() {
+        if depth > MAX_DEPTH || seen.len() >= MAX_GROUPS || !seen.insert(group.address()) {
+            continue;
+        }
+        // Damaged groups are not listed.
+        let Ok((groups, arrays)) = group.member_names() else { continue };
+        paths.extend(arrays.into_iter().map(|name| format!("{prefix}{name}")));
+        if paths.len() >= MAX_LISTED {
+            break;
+        }
+        for name in groups.into_iter().filter(|name| !name.starts_with('#')).rev() {
+            if let Ok(child) = group.group(&name) {
+                waiting.push((format!("{prefix}{name}/"), depth + 1, child));
+            }
+        }
+    }
+    paths
+}
+
+/// A name as it may stand in a line of Python that a user copies into a shell.
+pub(super) fn python_name(name: &str) -> String {
+    let plain = |c: char| c.is_alphanumeric() || "_-./ #".contains(c);
+    if name.chars().all(plain) { name.to_owned() } else { "NAME".to_owned() }
 }
 
 impl Samples for Hdf5Samples {
@@ -111,7 +203,8 @@ impl Samples for Hdf5Samples {
             *first = SliceInfoElem::Slice { start, end, step: 1 };
             self.next = end;
         }
-        let values = self.dataset.read_slice::<Value>(&SliceInfo { selections }).map_err(error)?;
+        let values = self.dataset.read_slice::<Value>(&SliceInfo { selections });
+        let values = values.map_err(|source| self.advice.error(source))?;
         let mut values: Vec<f32> = values.into_iter().map(|Value(value)| value).collect();
         if self.is_bool {
             values.iter_mut().for_each(|value| *value = f32::from(u8::from(*value != 0.0)));
@@ -192,24 +285,6 @@ fn sample_type(dtype: &Datatype) -> Option<(SampleType, ByteOrder)> {
     Some((sample, order))
 }
 
-/// The common name of an unsupported type, with a conversion if there is one.
-fn describe(dtype: &Datatype) -> String {
-    let name = match dtype {
-        Datatype::String { .. } | Datatype::VarLen { .. } => "text",
-        Datatype::Compound { .. } => {
-            "records, perhaps complex numbers (to convert to absolute values: python -c \"import h5py, numpy; \
-             numpy.save('out.npy', numpy.abs(h5py.File('in.h5')['mask'][()]))\")"
-        }
-        Datatype::Reference { .. } => {
-            "references, perhaps a cell array (to convert cells with one frame each: python -c \"import h5py, numpy; f = \
-             h5py.File('in.mat'); numpy.save('out.npy', [f[cell][()].T for cell in f['mask'][()].ravel()])\")"
-        }
-        Datatype::Enum { .. } => "an enumeration",
-        _ => "numbers of an unknown type",
-    };
-    name.to_owned()
-}
-
 /// Checks that all chunks of one entry of the first axis fit into the cache.
 fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     let Some(chunk) = dataset.chunks() else { return Ok(()) };
@@ -235,25 +310,74 @@ fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     })
 }
 
-/// Description of a group, as which MATLAB stores a struct.
-const GROUP: &str = "a group, perhaps a struct (to convert its first field: python -c \"import h5py, numpy; s = \
-     h5py.File('in.mat')['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0][()].T, -1, 0))\")";
+impl Advice {
+    /// The common name of an unsupported type, with a conversion if there is one.
+    fn describe(&self, dtype: &Datatype) -> String {
+        let name = &self.name;
+        match dtype {
+            Datatype::String { .. } | Datatype::VarLen { .. } => "text".to_owned(),
+            Datatype::Compound { .. } => format!(
+                "records, perhaps complex numbers (to convert to absolute values: python -c \"import h5py, numpy; a = \
+                 h5py.File('in.h5')['{name}'][()]; numpy.save('out.npy', abs(a['real'] + 1j * a['imag'] if a.dtype.names \
+                 else a))\")"
+            ),
+            Datatype::Reference { .. } => format!(
+                "references, perhaps a cell array (to convert cells with one frame each: python -c \"import h5py, numpy; f = \
+                 h5py.File('in.mat'); numpy.save('out.npy', [f[cell][()].T for cell in f['{name}'][()].ravel()])\")"
+            ),
+            Datatype::Enum { .. } => "an enumeration".to_owned(),
+            _ => "numbers of an unknown type".to_owned(),
+        }
+    }
 
-/// The error for an array with more than three dimensions.
-fn many_axes(count: usize, writer: Writer) -> FormatError {
-    let line = match writer {
-        Writer::Matlab => {
-            "a = h5py.File('in.mat')['mask'][()]; numpy.save('out.npy', \
-             a.reshape(-1, *a.shape[-2:]).transpose(0, 2, 1))"
+    /// The error for an array with another number of dimensions than two or three.
+    fn many_axes(&self, count: usize, writer: Writer) -> FormatError {
+        let name = &self.name;
+        if count < 2 {
+            return unsupported(format!("an array of {count} dimensions"));
         }
-        Writer::Rows | Writer::Fortran => {
-            "a = h5py.File('in.h5')['mask'][()]; numpy.save('out.npy', a.reshape(-1, *a.shape[-2:]))"
+        let line = match writer {
+            Writer::Matlab => format!(
+                "a = h5py.File('in.mat')['{name}'][()]; numpy.save('out.npy', \
+                 a.reshape(-1, *a.shape[-2:]).transpose(0, 2, 1))"
+            ),
+            Writer::Rows | Writer::Fortran => format!(
+                "a = h5py.File('in.h5')['{name}'][()]; numpy.save('out.npy', a.reshape(-1, *a.shape[-2:]))"
+            ),
+        };
+        let line = format!("python -c \"import h5py, numpy; {line}\"");
+        unsupported(format!(
+            "an array of {count} dimensions (to convert it to a stack of pictures: {line})"
+        ))
+    }
+
+    fn error(&self, error: Error) -> FormatError {
+        let name = &self.name;
+        match error {
+            Error::Context { source, .. } => self.error(*source),
+            Error::Io(source) => FormatError::Io { action: "read the HDF5 file", source },
+            Error::UnexpectedEof { offset, needed, available } => FormatError::Truncated {
+                format: Format::Hdf5,
+                promised: format!("{needed} bytes at {offset}"),
+                present: format!("{available} bytes"),
+            },
+            Error::UnsupportedFilter(filter) => FormatError::Unsupported {
+                format: Format::Hdf5,
+                found: format!(
+                    "chunks that are compressed by {filter} (to convert them: python -c \"import hdf5plugin, h5py, numpy; \
+                     numpy.save('out.npy', h5py.File('in.h5')['{name}'][()])\")"
+                ),
+                accepted: "no compression, deflate, LZF, LZ4, szip, shuffle, scale-offset, n-bit and Fletcher-32",
+            },
+            other => FormatError::malformed(
+                Format::Hdf5,
+                format!(
+                    "{other} (to convert it with h5py: python -c \"import hdf5plugin, h5py, numpy; \
+                     numpy.save('out.npy', h5py.File('in.h5')['{name}'][()])\")"
+                ),
+            ),
         }
-    };
-    let line = format!("python -c \"import h5py, numpy; {line}\"");
-    unsupported(format!(
-        "an array of {count} dimensions (to convert it to a stack of pictures: {line})"
-    ))
+    }
 }
 
 fn unsupported(found: String) -> FormatError {
@@ -261,24 +385,6 @@ fn unsupported(found: String) -> FormatError {
         format: Format::Hdf5,
         found,
         accepted: "integers and floats of 8 to 64 bits and booleans, in 2 or 3 dimensions",
-    }
-}
-
-fn error(error: Error) -> FormatError {
-    match error {
-        Error::Io(source) => FormatError::Io { action: "read the HDF5 file", source },
-        Error::UnexpectedEof { offset, needed, available } => FormatError::Truncated {
-            format: Format::Hdf5,
-            promised: format!("{needed} bytes at {offset}"),
-            present: format!("{available} bytes"),
-        },
-        other => FormatError::malformed(
-            Format::Hdf5,
-            format!(
-                "{other} (to convert it with h5py: python -c \"import h5py, numpy; numpy.save('out.npy', \
-                 h5py.File('in.h5')['mask'][()])\")"
-            ),
-        ),
     }
 }
 

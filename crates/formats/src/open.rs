@@ -1,18 +1,19 @@
 //! Opens files of any supported format as stacks of frames.
 
 use std::fs::File;
-use std::io::{Read, Seek};
+use std::io::{BufReader, Read, Seek};
+use std::os::unix::fs::FileExt;
 use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::Array3;
 
-use super::format::{HEAD_BYTES, describe};
+use super::format::{HDF5_MAGIC, HEAD_BYTES, describe};
 use super::mat::{self, SceneArray};
 use super::pictures::Pictures;
 use super::{
-    Axes, Expected, Format, FormatError, FrameReader, Limits, StackInfo, hdf5, npy, npz, png, tar,
-    tiff, zip,
+    Axes, Expected, Format, FormatError, FrameReader, Limits, Packing, Part, StackInfo, hdf5, npy,
+    npz, png, tar, tiff, zip,
 };
 use crate::error::Result;
 
@@ -28,11 +29,21 @@ pub struct Wanted<'a> {
     pub name: Option<&'a str>,
     /// Prior knowledge about its shape.
     pub expected: Expected,
+    /// The part that is read.
+    pub part: Part,
+    /// How the pixels are packed; `None` for one sample per value.
+    pub packing: Option<Packing>,
 }
 
 impl From<SceneArray> for Wanted<'_> {
     fn from(array: SceneArray) -> Self {
-        Self { array, name: None, expected: Expected::default() }
+        Self {
+            array,
+            name: None,
+            expected: Expected::default(),
+            part: Part::default(),
+            packing: None,
+        }
     }
 }
 
@@ -51,14 +62,30 @@ pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + 
 /// Opens a stack of frames like [`open_stack`], or one array of a .mat, HDF5 or npz file. For MATLAB files
 /// [`StackInfo::default_full_scale`] is [`SceneArray::default_full_scale`].
 ///
-/// Errors: as [`open_stack`]; [`FormatError::MissingArray`], [`FormatError::NoNames`], [`FormatError::AxesAmbiguous`]
-/// and [`FormatError::NoAxes`].
+/// Packed pixels may also be in a file without a header, if the size of its pictures is known.
+///
+/// Errors: as [`open_stack`]; [`FormatError::MissingArray`], [`FormatError::NoNames`], [`FormatError::AxesAmbiguous`],
+/// [`FormatError::NoAxes`] and [`FormatError::Part`].
 pub fn open_array<'a>(
     path: &Path,
     wanted: impl Into<Wanted<'a>>,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
-    open_any(path, Some(wanted.into()), limits)
+    let mut wanted = wanted.into();
+    let Some(packing) = wanted.packing else {
+        return wanted.part.of(open_any(path, Some(wanted), limits)?);
+    };
+    let size = wanted.expected.size;
+    wanted.expected.size = size.map(|(height, width)| (height, packing.stored_width(width)));
+    let unpacked = match open_any(path, Some(wanted), limits) {
+        Err(FormatError::UnknownFormat { .. }) => {
+            let file = File::open(path).map_err(FormatError::io("open the file"))?;
+            let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
+            packing.raw(BufReader::new(file), length, size, limits)?
+        }
+        opened => packing.rows_of(opened?)?,
+    };
+    wanted.part.of(unpacked)
 }
 
 fn open_any(
@@ -66,7 +93,8 @@ fn open_any(
     wanted: Option<Wanted<'_>>,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
-    let (file, length, format) = open(path)?;
+    let name = wanted.map_or("mask", |wanted| wanted.name.unwrap_or(wanted.array.name()));
+    let (file, length, format) = open(path, name)?;
     limits.check_file(format, length)?;
     if format == Format::Zip {
         return open_zip(file, length, wanted, limits);
@@ -99,7 +127,7 @@ fn open_any(
                          [part.channels['Y'].pixels for part in f.parts])\")";
             return Err(FormatError::UnknownFormat { found: found.to_owned(), accepted: ACCEPTED });
         }
-        Format::Npy | Format::Zip | Format::Npz | Format::Planar => {
+        Format::Npy | Format::Zip | Format::Npz | Format::Planar | Format::Raw => {
             return Err(FormatError::UnknownFormat {
                 found: format!("it is a {format} file"),
                 accepted: ACCEPTED,
@@ -119,7 +147,7 @@ fn open_zip(
     let members = zip::members(&file, length)?;
     let arrays = members.iter().filter(|member| member.name.ends_with(npz::EXTENSION)).count();
     match wanted {
-        Some(Wanted { array, name, expected }) if arrays > 0 => {
+        Some(Wanted { array, name, expected, .. }) if arrays > 0 => {
             npz::open(Arc::new(file), members, (array, name, &expected), limits)
         }
         None if arrays == 1 => {
@@ -179,8 +207,8 @@ pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Arra
     Ok((info, stack))
 }
 
-/// Opens a file, and determines its length and format.
-pub(super) fn open(path: &Path) -> Result<(File, u64, Format)> {
+/// Opens a file, and determines its length and format. `name` is the array that an error mentions.
+pub(super) fn open(path: &Path, name: &str) -> Result<(File, u64, Format)> {
     let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
     let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
     let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };
@@ -196,6 +224,24 @@ pub(super) fn open(path: &Path) -> Result<(File, u64, Format)> {
         .read_to_end(&mut head)
         .map_err(FormatError::io("read the file"))?;
     file.rewind().map_err(FormatError::io("read the file"))?;
-    let format = Format::sniff(&head).ok_or_else(|| unknown(describe(&head)))?;
+    let format = match Format::sniff(&head) {
+        Some(format) => format,
+        None if has_user_block(&file, metadata.len())? => Format::Hdf5,
+        None => return Err(unknown(describe(&head, &hdf5::python_name(name)))),
+    };
     Ok((file, metadata.len(), format))
+}
+
+/// True if the file is HDF5 after a user block, which has 512 bytes or a larger power of 2.
+fn has_user_block(file: &File, length: u64) -> Result<bool> {
+    let mut start = HEAD_BYTES;
+    while start + HDF5_MAGIC.len() as u64 <= length {
+        let mut magic = [0; HDF5_MAGIC.len()];
+        file.read_exact_at(&mut magic, start).map_err(FormatError::io("read the file"))?;
+        if magic == *HDF5_MAGIC {
+            return Ok(true);
+        }
+        start *= 2;
+    }
+    Ok(false)
 }

@@ -105,67 +105,124 @@ fn picture(
     }
 }
 
-/// Sorts the pictures by number. Errors: names that differ in more than the number; missing or repeated numbers.
+/// Sorts the pictures by their counter. Errors: names that differ in more than numbers; a gap in the counter; numbers
+/// that rise in different orders.
 fn in_order(format: Format, members: Vec<Member>) -> Result<Vec<Member>> {
-    let mut numbered = Vec::with_capacity(members.len());
-    let mut shared: Option<(String, String)> = None;
-    // Operating systems add hidden files to archives.
-    let hidden = |name: &str| {
-        let (folder, file) = name.rsplit_once('/').unwrap_or(("", name));
-        file.starts_with('.') || folder.split('/').any(|part| part == "__MACOSX")
-    };
-    for member in members.into_iter().filter(|member| !hidden(&member.name)) {
-        let Some((before, number, after)) = split(&member.name) else {
+    let mut numbered: Vec<(Vec<u128>, Member)> = Vec::with_capacity(members.len());
+    let mut shared: Option<Vec<String>> = None;
+    for member in members.into_iter().filter(|member| !is_ignored(&member.name)) {
+        let Some(Parts { texts, numbers }) = Parts::of(&member.name) else {
             let found = format!("{}, whose name has no number", quoted(&member.name));
             return Err(unsupported(format, found));
         };
-        let (first_before, first_after) =
-            shared.get_or_insert_with(|| (before.to_owned(), after.to_owned()));
-        if (before, after) != (&**first_before, &**first_after) {
-            let other = format!("{first_before}N{first_after}");
+        let shared =
+            shared.get_or_insert_with(|| texts.iter().map(|text| (*text).to_owned()).collect());
+        if texts != *shared {
+            let other = shared.join("N");
             let found = format!("{} among {}", quoted(&member.name), quoted(&other));
             return Err(unsupported(format, found));
         }
-        numbered.push((number, member));
+        numbered.push((numbers, member));
     }
-    numbered.sort_by_key(|(number, _)| *number);
-    for pair in numbered.windows(2) {
-        let ((number, member), (next, other)) = (&pair[0], &pair[1]);
-        if number == next {
-            let found = format!(
-                "{} and {}, which have the same number",
-                quoted(&member.name),
-                quoted(&other.name)
-            );
-            return Err(unsupported(format, found));
-        }
-        if number + 1 != *next {
-            let found = format!(
-                "{} after {}: the pictures in between are missing",
-                quoted(&other.name),
-                quoted(&member.name)
-            );
-            return Err(unsupported(format, found));
-        }
-    }
-    if numbered.is_empty() {
+    let Some((first, _)) = numbered.first() else {
         return Err(unsupported(format, "no pictures".to_owned()));
+    };
+    let varies =
+        |place: &usize| numbered.iter().any(|(numbers, _)| numbers[*place] != first[*place]);
+    let varying: Vec<usize> = (0..first.len()).filter(varies).collect();
+    let Some(&last) = varying.last() else {
+        return match &*numbered {
+            [(_, first), (_, second), ..] => Err(unsupported(format, same_number(first, second))),
+            _ => Ok(numbered.into_iter().map(|(_, member)| member).collect()),
+        };
+    };
+    let by_place = |place: usize| move |(numbers, _): &(Vec<u128>, Member)| numbers[place];
+    for &counter in varying.iter().rev() {
+        numbered.sort_by_key(by_place(counter));
+        if !numbered
+            .windows(2)
+            .all(|pair| pair[0].0[counter].checked_add(1) == Some(pair[1].0[counter]))
+        {
+            continue;
+        }
+        let others = |numbers: &[u128]| -> Vec<u128> {
+            varying.iter().filter(|place| **place != counter).map(|place| numbers[*place]).collect()
+        };
+        if let Some(pair) = numbered.windows(2).find(|pair| others(&pair[0].0) > others(&pair[1].0))
+        {
+            let found = format!(
+                "{} and {}: one number in the names rises where another falls",
+                quoted(&pair[0].1.name),
+                quoted(&pair[1].1.name)
+            );
+            return Err(unsupported(format, found));
+        }
+        return Ok(numbered.into_iter().map(|(_, member)| member).collect());
     }
-    Ok(numbered.into_iter().map(|(_, member)| member).collect())
+    numbered.sort_by_key(by_place(last));
+    let step =
+        |pair: &&[(Vec<u128>, Member)]| pair[0].0[last].checked_add(1) != Some(pair[1].0[last]);
+    let found = match numbered.windows(2).find(step) {
+        Some([(number, member), (next, other)]) if number[last] == next[last] => {
+            same_number(member, other)
+        }
+        Some([(_, member), (_, other)]) => format!(
+            "{} after {}: the pictures in between are missing",
+            quoted(&other.name),
+            quoted(&member.name)
+        ),
+        _ => "pictures without a common counter".to_owned(),
+    };
+    Err(unsupported(format, found))
 }
 
-/// Splits a file name into the part before its last number, the number, and the part after it. Digits of the extension
-/// do not count.
-fn split(name: &str) -> Option<(&str, u64, &str)> {
-    let stem = name.rfind('.').unwrap_or(name.len());
-    let end = name[..stem].rfind(|c: char| c.is_ascii_digit())? + 1;
-    let start = name[..end].rfind(|c: char| !c.is_ascii_digit());
-    let start = start.map_or(0, |at| at + name[at..].chars().next().map_or(1, char::len_utf8));
-    // The number of a folder is not that of a frame.
-    if name[end..stem].contains('/') {
-        return None;
+fn same_number(first: &Member, second: &Member) -> String {
+    format!("{} and {}, which have the same number", quoted(&first.name), quoted(&second.name))
+}
+
+/// Extensions of texts and tables that people and programs put beside pictures.
+const IGNORED_EXTENSIONS: [&str; 13] =
+    ["txt", "md", "rst", "json", "xml", "csv", "ini", "log", "yaml", "yml", "html", "pdf", "db"];
+/// Names of such files, without their extensions.
+const IGNORED_STEMS: [&str; 3] = ["readme", "license", "licence"];
+
+/// True for files that are not meant as frames: hidden files, those of operating systems, and texts.
+fn is_ignored(name: &str) -> bool {
+    let (folder, file) = name.rsplit_once('/').unwrap_or(("", name));
+    let file = file.to_ascii_lowercase();
+    let (stem, extension) = file.split_once('.').unwrap_or((&file, ""));
+    let extension = extension.rsplit('.').next().unwrap_or_default();
+    file.starts_with('.')
+        || folder.split('/').any(|part| part == "__MACOSX")
+        || IGNORED_STEMS.contains(&stem)
+        || IGNORED_EXTENSIONS.contains(&extension)
+}
+
+/// The name of a picture, split at its numbers. Digits of folders and of the extension belong to the texts.
+#[derive(Debug, PartialEq, Eq)]
+struct Parts<'a> {
+    /// One more than numbers.
+    texts: Vec<&'a str>,
+    numbers: Vec<u128>,
+}
+
+impl<'a> Parts<'a> {
+    /// `None` for names without a number, or with one beyond 128 bits.
+    fn of(name: &'a str) -> Option<Self> {
+        let file = name.rfind('/').map_or(0, |slash| slash + 1);
+        let end = name[file..].rfind('.').map_or(name.len(), |point| file + point);
+        let (mut texts, mut numbers, mut text, mut place) = (Vec::new(), Vec::new(), 0, file);
+        while let Some(start) = name[place..end].find(|c: char| c.is_ascii_digit()) {
+            let start = place + start;
+            let length = name[start..end].find(|c: char| !c.is_ascii_digit());
+            let stop = length.map_or(end, |length| start + length);
+            texts.push(&name[text..start]);
+            numbers.push(name[start..stop].parse().ok()?);
+            (text, place) = (stop, stop);
+        }
+        texts.push(&name[text..]);
+        (!numbers.is_empty()).then_some(Self { texts, numbers })
     }
-    Some((&name[..start], name[start..end].parse().ok()?, &name[end..]))
 }
 
 fn in_member(name: &str) -> impl FnOnce(FormatError) -> FormatError {
@@ -176,20 +233,31 @@ fn in_member(name: &str) -> impl FnOnce(FormatError) -> FormatError {
     }
 }
 
+/// Reads the pictures of an archive in natural order, which sorts the numbers of names by value.
+macro_rules! conversion {
+    ($module:literal, $open:literal, $names:literal, $read:literal) => {
+        concat!(
+            "PNG or TIFF pictures whose names differ only in consecutive numbers (to convert all pictures in the natural \
+             order of their names: python -c \"import re, ",
+            $module,
+            ", numpy; from PIL import Image; ",
+            $open,
+            "; k = lambda n: [int(t) if i % 2 else t for i, t in enumerate(re.split('([0-9]+)', n))]; \
+             numpy.save('out.npy', [numpy.asarray(Image.open(",
+            $read,
+            ")) for n in sorted(",
+            $names,
+            ", key=k) if n.lower().endswith(('.png', '.tif', '.tiff')) and '/._' not in '/' + n])\")"
+        )
+    };
+}
+
 fn unsupported(format: Format, found: String) -> FormatError {
     let accepted = match format {
         Format::Tar => {
-            "PNG or TIFF pictures whose names differ only in consecutive numbers (to convert all .png \
-             files in the order of their names: python -c \"import tarfile, numpy; from PIL import Image; \
-             t = tarfile.open('in.tar'); numpy.save('out.npy', [numpy.asarray(Image.open(t.extractfile(n))) \
-             for n in sorted(t.getnames()) if n.endswith('.png')])\")"
+            conversion!("tarfile", "a = tarfile.open('in.tar')", "a.getnames()", "a.extractfile(n)")
         }
-        _ => {
-            "PNG or TIFF pictures whose names differ only in consecutive numbers (to convert all .png \
-             files in the order of their names: python -c \"import zipfile, numpy; from PIL import Image; \
-             z = zipfile.ZipFile('in.zip'); numpy.save('out.npy', [numpy.asarray(Image.open(z.open(n))) \
-             for n in sorted(z.namelist()) if n.endswith('.png')])\")"
-        }
+        _ => conversion!("zipfile", "a = zipfile.ZipFile('in.zip')", "a.namelist()", "a.open(n)"),
     };
     FormatError::Unsupported { format, found, accepted }
 }

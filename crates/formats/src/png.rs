@@ -78,7 +78,7 @@ impl<R: Read + Seek> PngReader<R> {
                 format: Format::Png,
                 found: "an animation".to_owned(),
                 accepted: "one image (to convert all frames: python -c \"import numpy; from PIL import Image, \
-                           ImageSequence; numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
+                           ImageSequence; numpy.save('out.npy', [numpy.array(p if p.mode == 'I;16' else p.convert('L')) for p in \
                            ImageSequence.Iterator(Image.open('in.png'))])\")",
             });
         }
@@ -207,8 +207,10 @@ fn unsupported(found: String) -> FormatError {
     FormatError::Unsupported {
         format: Format::Png,
         found,
-        accepted: "Grayscale without alpha, One, Eight or Sixteen bit, one image (to convert a colour picture to grey: \
-                   python -c \"from PIL import Image; Image.open('in.png').convert('L').save('out.png')\")",
+        accepted: "Grayscale without alpha, One, Eight or Sixteen bit, one image (to convert other pictures to grey \
+                   with all their bits: python -c \"import imagecodecs, numpy; a = imagecodecs.imread('in.png'); g = a if \
+                   a.ndim == 2 else a[..., :3] @ [.299, .587, .114] if a.shape[2] > 2 else a[..., 0]; numpy.save('out.npy', \
+                   g.round().astype(a.dtype))\")",
     }
 }
 

@@ -62,10 +62,17 @@ impl SampleType {
     /// pictures use, and 1 for floats and booleans. Other integers have no common scale.
     pub fn default_full_scale(self) -> Option<FullScale> {
         match self {
-            Self::U8 => Some(FullScale(255.0)),
-            Self::U16 => Some(FullScale(65535.0)),
-            Self::Bool | Self::F16 | Self::F32 | Self::F64 => Some(FullScale(1.0)),
-            Self::U32 | Self::U64 | Self::I8 | Self::I16 | Self::I32 | Self::I64 => None,
+            Self::Bool | Self::F16 | Self::F32 | Self::F64 => Some(FullScale::ONE),
+            other => other.largest().map(FullScale),
+        }
+    }
+
+    /// The largest value of unsigned integers of 8 and 16 bits, at which the pixels of cameras are full.
+    fn largest(self) -> Option<f32> {
+        match self {
+            Self::U8 => Some(255.0),
+            Self::U16 => Some(65535.0),
+            _ => None,
         }
     }
 }
@@ -114,6 +121,8 @@ pub struct StackInfo {
     /// The full scale if none is stated: [`SampleType::default_full_scale`], except for .mat scenes, where it is
     /// [`SceneArray::default_full_scale`](super::mat::SceneArray::default_full_scale).
     pub default_full_scale: Option<FullScale>,
+    /// The largest value that a camera can have stored, for unsigned integers of up to 16 bits.
+    pub largest: Option<f32>,
 }
 
 impl StackInfo {
@@ -133,7 +142,14 @@ impl StackInfo {
             format,
             axes: None,
             default_full_scale: sample.default_full_scale(),
+            largest: sample.largest(),
         }
+    }
+
+    /// The description of samples that use only a part of the bits of their type, with this largest value.
+    pub(super) fn with_largest(self, largest: f32) -> Result<Self> {
+        let default_full_scale = Some(FullScale::new(largest)?);
+        Ok(Self { default_full_scale, largest: Some(largest), ..self })
     }
 
     /// Number of voxels: frames x height x width.

@@ -1,53 +1,58 @@
 //! Reads TIFF and BigTIFF stacks with one grey frame per page.
 
+mod colours;
 mod directory;
+mod ome;
+mod refusal;
+mod tags;
 
-use std::io::{self, BufReader, ErrorKind, Read, Seek, SeekFrom};
+use std::fmt;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use ::tiff::decoder::{ChunkType, Decoder, DecodingResult, Limits as DecoderLimits};
-use ::tiff::tags::{PhotometricInterpretation, Tag};
-use ::tiff::{ColorType, TiffError};
+use ::tiff::tags::Tag;
 use ndarray::Array2;
 
 use super::array::{ArrayReader, RawSamples, Restart};
 use super::axes::Layout;
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
 use crate::error::Result;
-use directory::{Pages, malformed};
+use directory::Pages;
+use refusal::malformed;
+use tags::{ACCEPTED_SAMPLES, Tags, UNCOMPRESSED, in_page};
 
-const ACCEPTED_SAMPLES: &str = "one grey sample per pixel (BlackIsZero): unsigned 1, 8 or 16 bit, or 32- or 64-bit float (to convert others: \
-     python -c \"import numpy, tifffile; numpy.save('out.npy', tifffile.imread('in.tif'))\")";
-const ACCEPTED_COLOUR: &str = "grey, BlackIsZero (to convert colours to grey: python -c \"import numpy, tifffile; a = tifffile.imread('in.tif'); \
-     tifffile.imwrite('out.tif', (a[..., :3] @ numpy.array([.299, .587, .114])).round().astype(a.dtype))\")";
-const ACCEPTED_WHITE: &str = "BlackIsZero (to convert integers: python -c \"import tifffile; \
-     tifffile.imwrite('out.tif', ~tifffile.imread('in.tif'), photometric='minisblack')\")";
-const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits (to convert it: python -c \"import numpy; from PIL import Image, \
-     ImageSequence; numpy.save('out.npy', [numpy.array(page) for page in \
-     ImageSequence.Iterator(Image.open('in.tif'))])\")";
+const ACCEPTED_FORMATS: &str = "integers and floats (to convert others: python -c \"import imagecodecs, numpy, tifffile; numpy.save('out.npy', \
+     [p.asarray() for p in tifffile.TiffFile('in.tif').pages])\")";
+const ACCEPTED_COMPRESSION: &str = "no compression, LZW, Deflate, PackBits (to convert it: python -c \"import imagecodecs, numpy, tifffile; \
+     numpy.save('out.npy', tifffile.imread('in.tif'))\")";
+const ACCEPTED_AS_STORED: &str = "rows from top to bottom and columns from left to right (to keep the pixels as they are stored: python -c \"import \
+     imagecodecs, numpy, tifffile; numpy.save('out.npy', tifffile.imread('in.tif'))\")";
+const ACCEPTED_PREDICTOR: &str = "a predictor with LZW or Deflate only (to ignore it, as libtiff does: python -c \"import numpy; from PIL import Image, \
+     ImageSequence; numpy.save('out.npy', [numpy.array(page) for page in ImageSequence.Iterator(Image.open('in.tif'))])\")";
 const ACCEPTED_IMAGEJ: &str =
-    "contiguous images of 8, 16 or 32 bits that are not compressed, or one page per frame";
+    "contiguous images of 8, 16, 32 or 64 bits that are not compressed, or one page per frame";
 
-/// TIFF's number for no compression.
-const UNCOMPRESSED: u16 = 1;
+/// TIFF's number for PackBits.
+const PACK_BITS: u16 = 32773;
 /// TIFF's numbers for the supported compressions, all of them lossless.
-const SUPPORTED_COMPRESSIONS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, 32773];
+const SUPPORTED_COMPRESSIONS: [u16; 5] = [UNCOMPRESSED, 5, 8, 32946, PACK_BITS];
 
 /// Upper bound of the expansion of all compressions. LZW reaches at most 2560 bytes per compressed byte.
 const MAX_EXPANSION: u64 = 4096;
 
 /// Opens a TIFF file of `length` bytes. Its pages are frames of one size and type, or all frames follow one page
-/// header, as ImageJ writes them above 4 GB. All headers are checked against the limits, the length and each other.
-/// Pixels are not read.
+/// header, as ImageJ writes them above 4 GB and tifffile on request. All headers are checked against the limits, the
+/// length and each other. Pixels are not read.
 pub(super) fn open<R: Read + Seek + Send + 'static>(
     mut file: R,
     length: u64,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
-    let pages = directory::count_pages(&mut file, length, limits)?;
+    let pages = directory::read_pages(&mut file, length, limits)?;
     file.rewind().map_err(FormatError::io("read the TIFF"))?;
-    match pages.imagej_frames {
-        Some(frames) => Ok(Box::new(open_imagej(file, (frames, pages), length, limits)?)),
-        None => Ok(Box::new(TiffReader::open(file, pages.count, length, limits)?)),
+    match pages.contiguous {
+        Some(frames) => Ok(Box::new(open_contiguous(file, (frames, pages), length, limits)?)),
+        None => Ok(Box::new(TiffReader::open(file, pages.frames, length, limits)?)),
     }
 }
 
@@ -66,15 +71,16 @@ impl<R: Read + Seek + Send> Restart for DecoderFile<R> {
     }
 }
 
-/// Opens an ImageJ stack of more than 4 GB. Its page header describes the first frame; all other frames follow it.
-fn open_imagej<R: Read + Seek + Send>(
+/// Opens a stack with one page header, which describes the first frame. All other frames follow it.
+fn open_contiguous<R: Read + Seek + Send>(
     file: R,
     (frames, pages): (u64, Pages),
     length: u64,
     limits: &Limits,
 ) -> Result<ArrayReader<RawSamples<DecoderFile<R>>>> {
     let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
-    let first = read_page(&mut decoder, 0, length, limits)?;
+    let page = read_page(&mut decoder, 0, length, limits)?;
+    let first = page.info;
     limits.check_shape(Format::Tiff, frames, first.height as u64, first.width as u64)?;
     let info = StackInfo { frames: frames as usize, ..first };
     let compression: Option<u16> =
@@ -83,12 +89,14 @@ fn open_imagej<R: Read + Seek + Send>(
     let contiguous = ranges.windows(2).all(|pair| pair[0].0 + pair[0].1 == pair[1].0);
     let plain = compression.unwrap_or(UNCOMPRESSED) == UNCOMPRESSED
         && decoder.get_chunk_type() == ChunkType::Strip
-        && first.sample != SampleType::Bool;
+        && !page.is_packed()
+        && !page.by_rows
+        && !page.reversed;
     let (true, true, Some((start, _))) = (plain, contiguous, ranges.first()) else {
         return Err(FormatError::Unsupported {
             format: Format::Tiff,
             found: format!(
-                "an ImageJ stack of {frames} images after one page header, compressed or not contiguous"
+                "a stack of {frames} images after one page header, compressed or not contiguous"
             ),
             accepted: ACCEPTED_IMAGEJ,
         });
@@ -114,35 +122,62 @@ fn open_imagej<R: Read + Seek + Send>(
 /// Reads a TIFF file whose pages are frames of one size and type.
 struct TiffReader<R: Read + Seek> {
     decoder: Decoder<BufReader<R>>,
+    /// The number of each frame's page.
+    pages: Vec<usize>,
+    page: Page,
     info: StackInfo,
     next: usize,
 }
 
 impl<R: Read + Seek> TiffReader<R> {
-    fn open(file: R, frames: usize, length: u64, limits: &Limits) -> Result<Self> {
+    fn open(file: R, pages: Vec<usize>, length: u64, limits: &Limits) -> Result<Self> {
         let mut decoder = Decoder::new(BufReader::new(file)).map_err(|e| in_page(0, e))?;
-        let first = read_page(&mut decoder, 0, length, limits)?;
-        for number in 1..frames {
-            decoder.next_image().map_err(|e| in_page(number, e))?;
+        // In this order the decoder finds all pages in one pass.
+        let mut in_file: Vec<usize> = pages.clone();
+        in_file.sort_unstable();
+        let mut first: Option<(usize, Page)> = None;
+        for number in in_file {
+            decoder.seek_to_image(number).map_err(|e| in_page(number, e))?;
             let page = read_page(&mut decoder, number, length, limits)?;
+            let (other, first) = *first.get_or_insert((number, page));
             if page != first {
                 return Err(malformed(format!(
-                    "page {number} is {}x{} {}, but page 0 is {}x{} {} (counted from 0); \
+                    "page {number} is {page}, but page {other} is {first} (counted from 0); \
                      all pages must have the same size and type (to drop the others: python -c \"import numpy, tifffile; \
                      p = tifffile.TiffFile('in.tif').pages; numpy.save('out.npy', [a.asarray() for a in p if \
-                     a.shape == p[0].shape])\")",
-                    page.height, page.width, page.sample, first.height, first.width, first.sample
+                     (a.shape, a.dtype) == (p[{other}].shape, p[{other}].dtype)])\")",
                 )));
             }
         }
-        let info = StackInfo { frames, ..first };
+        let (_, page) = first.ok_or_else(|| malformed("the file has no pages".to_owned()))?;
+        let info = StackInfo { frames: pages.len(), ..page.info };
         limits.check_info(&info)?;
         let mut decoder_limits = DecoderLimits::default();
         // The decoder also counts the values of a page header against this limit.
         let frame_bytes = info.height * info.width * info.sample.bytes();
         decoder_limits.decoding_buffer_size = decoder_limits.decoding_buffer_size.max(frame_bytes);
         decoder_limits.intermediate_buffer_size = usize::try_from(length).unwrap_or(usize::MAX);
-        Ok(Self { decoder: decoder.with_limits(decoder_limits), info, next: 0 })
+        Ok(Self { decoder: decoder.with_limits(decoder_limits), pages, page, info, next: 0 })
+    }
+
+    /// Reads the stored rows of the current page. Bytes that a strip lacks are 0.
+    fn read_rows(&mut self, page: usize) -> Result<Vec<u8>> {
+        let row_bytes = self.page.row_bytes();
+        let (_, strip_rows) = self.decoder.chunk_dimensions();
+        let mut bytes = Vec::with_capacity(row_bytes * self.info.height);
+        for (start, length) in chunk_ranges(&mut self.decoder, page)? {
+            let rows = (self.info.height - bytes.len() / row_bytes).min(strip_rows as usize);
+            let end = bytes.len() + rows * row_bytes;
+            let file = self.decoder.inner();
+            let length = length.min((rows * row_bytes) as u64);
+            let read = file
+                .seek(SeekFrom::Start(start))
+                .and_then(|_| file.by_ref().take(length).read_to_end(&mut bytes));
+            read.map_err(FormatError::io("read the TIFF page"))?;
+            bytes.resize(end, 0);
+        }
+        bytes.resize(row_bytes * self.info.height, 0);
+        Ok(bytes)
     }
 }
 
@@ -152,103 +187,196 @@ impl<R: Read + Seek> FrameReader for TiffReader<R> {
     }
 
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        let page = self.next;
-        if page == self.info.frames {
-            return Ok(None);
-        }
+        let Some(&page) = self.pages.get(self.next) else { return Ok(None) };
         self.next += 1;
         self.decoder.seek_to_image(page).map_err(|e| in_page(page, e))?;
-        let values = match self.decoder.read_image().map_err(|e| in_page(page, e))? {
-            DecodingResult::U8(bytes) if self.info.sample == SampleType::Bool => {
-                bits(&bytes, self.info.width)
-            }
-            DecodingResult::U8(values) => values.into_iter().map(f32::from).collect(),
-            DecodingResult::U16(values) => values.into_iter().map(f32::from).collect(),
-            DecodingResult::F32(values) => values,
-            DecodingResult::F64(values) => values.into_iter().map(|value| value as f32).collect(),
-            _ => {
-                return Err(FormatError::Internal(format!(
-                    "TIFF page {page} has unexpected samples"
-                )));
+        let Page { bits, reversed, .. } = self.page;
+        let values = if self.page.by_rows {
+            unpack(&self.read_rows(page)?, self.page.row_bytes(), (self.info.width, bits))
+        } else {
+            match self.decoder.read_image().map_err(|e| in_page(page, e))? {
+                DecodingResult::U8(mut bytes) => {
+                    if reversed {
+                        bytes.iter_mut().for_each(|byte| *byte = byte.reverse_bits());
+                    }
+                    unpack(&bytes, self.page.row_bytes(), (self.info.width, bits))
+                }
+                DecodingResult::U16(values) => {
+                    let bytes_reversed = |value: u16| value.reverse_bits().swap_bytes();
+                    let value = |value| if reversed { bytes_reversed(value) } else { value };
+                    values.into_iter().map(|stored| f32::from(value(stored))).collect()
+                }
+                DecodingResult::U32(values) => values.into_iter().map(|v| v as f32).collect(),
+                DecodingResult::U64(values) => values.into_iter().map(|v| v as f32).collect(),
+                DecodingResult::I8(values) => values.into_iter().map(f32::from).collect(),
+                DecodingResult::I16(values) => values.into_iter().map(f32::from).collect(),
+                DecodingResult::I32(values) => values.into_iter().map(|v| v as f32).collect(),
+                DecodingResult::I64(values) => values.into_iter().map(|v| v as f32).collect(),
+                DecodingResult::F16(values) => values.into_iter().map(|v| v.to_f32()).collect(),
+                DecodingResult::F32(values) => values,
+                DecodingResult::F64(values) => values.into_iter().map(|v| v as f32).collect(),
             }
         };
         samples::frame(self.info.height, self.info.width, values).map(Some)
     }
 }
 
-/// Unpacks rows of single bits, most significant bit first. Each row starts at a whole byte.
-fn bits(bytes: &[u8], width: usize) -> Vec<f32> {
-    let rows = bytes.chunks_exact(width.div_ceil(8).max(1));
-    let bit = |row: &[u8], column: usize| f32::from(row[column / 8] >> (7 - column % 8) & 1);
-    rows.flat_map(|row| (0..width).map(move |column| bit(row, column))).collect()
+/// Unpacks rows of samples of `bits` bits, most significant bit first. Each row starts at a whole byte.
+fn unpack(bytes: &[u8], row_bytes: usize, (width, bits): (usize, u8)) -> Vec<f32> {
+    if bits == 8 {
+        return bytes.iter().map(|byte| f32::from(*byte)).collect();
+    }
+    let bits = usize::from(bits);
+    let sample = |row: &[u8], column: usize| {
+        let (first, last) = (column * bits, (column + 1) * bits);
+        let word = row[first / 8..last.div_ceil(8)]
+            .iter()
+            .fold(0u32, |word, byte| word << 8 | u32::from(*byte));
+        let unused = last.div_ceil(8) * 8 - last;
+        ((word >> unused) & ((1 << bits) - 1)) as f32
+    };
+    let rows = bytes.chunks_exact(row_bytes.max(1));
+    rows.flat_map(|row| (0..width).map(move |column| sample(row, column))).collect()
 }
 
-/// Checks the header of the current page of the decoder. The result has one frame.
+/// The description of a page.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Page {
+    /// The page as a stack of one frame.
+    info: StackInfo,
+    /// Number of bits of a sample.
+    bits: u8,
+    /// True if the bits of each stored byte are in reverse order.
+    reversed: bool,
+    /// True if the stored rows are read without the decoder.
+    by_rows: bool,
+}
+
+impl Page {
+    /// True if samples do not fill whole bytes.
+    fn is_packed(&self) -> bool {
+        self.bits % 8 != 0
+    }
+
+    fn row_bytes(&self) -> usize {
+        (self.info.width * usize::from(self.bits)).div_ceil(8)
+    }
+}
+
+impl fmt::Display for Page {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let StackInfo { height, width, sample, .. } = self.info;
+        write!(f, "{height}x{width} {sample}")?;
+        if self.is_packed() && self.bits > 1 {
+            write!(f, " of {} bits", self.bits)?;
+        }
+        if self.reversed {
+            write!(f, " in reverse order")?;
+        }
+        Ok(())
+    }
+}
+
+/// Checks the header of the current page of the decoder.
 fn read_page<R: Read + Seek>(
     decoder: &mut Decoder<BufReader<R>>,
     page: usize,
     length: u64,
     limits: &Limits,
-) -> Result<StackInfo> {
+) -> Result<Page> {
     let (width, height) = decoder.dimensions().map_err(|e| in_page(page, e))?;
     limits.check_shape(Format::Tiff, 1, height.into(), width.into())?;
-    let sample = sample_type(decoder, page)?;
-    let info = StackInfo::new(Format::Tiff, sample, 1, height as usize, width as usize);
-    check_chunks(decoder, page, &info, length, limits)?;
-    Ok(info)
+    let mut tags = Tags { decoder, page };
+    let palette = colours::check(&mut tags)?;
+    let (sample, bits) = sample_type(&mut tags)?;
+    let reversed = check_storage(&mut tags, sample, bits)?;
+    let mut info = StackInfo::new(Format::Tiff, sample, 1, height as usize, width as usize);
+    if !bits.is_multiple_of(8) && bits > 1 {
+        let largest = f32::from((1u16 << bits) - 1);
+        info = info.with_largest(largest)?;
+    }
+    // The decoder supports neither palettes nor these bit depths.
+    let by_rows = palette || (bits > 8 && !bits.is_multiple_of(8));
+    let checked = Page { info, bits, reversed, by_rows };
+    check_chunks(decoder, page, &checked, length, limits)?;
+    Ok(checked)
 }
 
-fn sample_type<R: Read + Seek>(
-    decoder: &mut Decoder<BufReader<R>>,
-    page: usize,
-) -> Result<SampleType> {
-    let tag = |decoder: &mut Decoder<_>, tag, default: u16| {
-        decoder.find_tag_unsigned(tag).map(|v| v.unwrap_or(default)).map_err(|e| in_page(page, e))
-    };
-    let refused = |found: String, accepted| FormatError::Unsupported {
-        format: Format::Tiff,
-        found: format!("{found} (page {page})"),
-        accepted,
-    };
-    let unsupported = |found| refused(found, ACCEPTED_SAMPLES);
-    let black_is_zero = PhotometricInterpretation::BlackIsZero.to_u16();
-    let photometric = tag(decoder, Tag::PhotometricInterpretation, black_is_zero)?;
-    if photometric != black_is_zero {
-        if photometric == PhotometricInterpretation::WhiteIsZero.to_u16() {
-            return Err(refused("WhiteIsZero".to_owned(), ACCEPTED_WHITE));
+/// The type of the samples, and their number of bits.
+fn sample_type<R: Read + Seek>(tags: &mut Tags<'_, R>) -> Result<(SampleType, u8)> {
+    let bits = tags.numbers(Tag::BitsPerSample)?.first().copied().unwrap_or(1);
+    let bits = u8::try_from(bits).unwrap_or(u8::MAX);
+    let format = tags.numbers(Tag::SampleFormat)?.first().copied().unwrap_or(1);
+    let sample = match (format, bits) {
+        (1, 1) => SampleType::Bool,
+        (1, 2..=8) => SampleType::U8,
+        (1, 9..=16) => SampleType::U16,
+        (1, 32) => SampleType::U32,
+        (1, 64) => SampleType::U64,
+        (2, 8) => SampleType::I8,
+        (2, 16) => SampleType::I16,
+        (2, 32) => SampleType::I32,
+        (2, 64) => SampleType::I64,
+        (3, 16) => SampleType::F16,
+        (3, 32) => SampleType::F32,
+        (3, 64) => SampleType::F64,
+        (1, _) => {
+            return Err(tags.refused(format_args!("unsigned {bits}-bit samples"), ACCEPTED_SAMPLES));
         }
-        let found = match PhotometricInterpretation::from_u16(photometric) {
-            Some(name) => format!("{name:?} colours"),
-            None => format!("photometric interpretation {photometric}"),
-        };
-        return Err(refused(found, ACCEPTED_COLOUR));
-    }
-    let bits = match decoder.colortype().map_err(|e| in_page(page, e))? {
-        ColorType::Gray(bits) => bits,
-        other => return Err(refused(format!("{other:?}"), ACCEPTED_COLOUR)),
+        (2, _) => {
+            return Err(tags.refused(format_args!("signed {bits}-bit samples"), ACCEPTED_SAMPLES));
+        }
+        (3, _) => {
+            return Err(tags.refused(format_args!("{bits}-bit float samples"), ACCEPTED_SAMPLES));
+        }
+        _ => return Err(tags.refused(format_args!("sample format {format}"), ACCEPTED_FORMATS)),
     };
-    let formats: Vec<u16> = decoder
-        .find_tag_unsigned_vec(Tag::SampleFormat)
-        .map_err(|e| in_page(page, e))?
-        .unwrap_or_else(|| vec![1]);
-    match (formats.first().copied(), bits) {
-        (Some(1), 1) => Ok(SampleType::Bool),
-        (Some(1), 8) => Ok(SampleType::U8),
-        (Some(1), 16) => Ok(SampleType::U16),
-        (Some(3), 32) => Ok(SampleType::F32),
-        (Some(3), 64) => Ok(SampleType::F64),
-        (Some(1), _) => Err(unsupported(format!("unsigned {bits}-bit samples"))),
-        (Some(2), _) => Err(unsupported(format!("signed {bits}-bit samples"))),
-        (Some(3), _) => Err(unsupported(format!("{bits}-bit float samples"))),
-        _ => Err(unsupported(format!("sample format {formats:?}"))),
+    Ok((sample, bits))
+}
+
+/// Checks the tags that change the order of pixels or bits. Returns true if the bits of each byte are reversed.
+fn check_storage<R: Read + Seek>(
+    tags: &mut Tags<'_, R>,
+    sample: SampleType,
+    bits: u8,
+) -> Result<bool> {
+    let orientation = tags.number(Tag::Orientation, 1)?;
+    if orientation > 1 {
+        let found = format_args!("orientation {orientation}, which turns or mirrors the picture");
+        return Err(tags.refused(found, ACCEPTED_AS_STORED));
     }
+    let compression = tags.number(Tag::Compression, UNCOMPRESSED)?;
+    if !SUPPORTED_COMPRESSIONS.contains(&compression) {
+        let found = format_args!("compression number {compression}");
+        return Err(tags.refused(found, ACCEPTED_COMPRESSION));
+    }
+    let predictor = tags.number(Tag::Predictor, 1)?;
+    if predictor > 1 && [UNCOMPRESSED, PACK_BITS].contains(&compression) {
+        let found = format_args!("predictor {predictor} with compression number {compression}");
+        return Err(tags.refused(found, ACCEPTED_PREDICTOR));
+    }
+    if bits > 8 && !bits.is_multiple_of(8) {
+        if !tags.is_plain()? {
+            let found = format_args!("{bits}-bit samples in tiles or compressed");
+            return Err(tags.refused(found, ACCEPTED_SAMPLES));
+        }
+    }
+    let reversed = tags.number(Tag::FillOrder, 1)? == 2;
+    let integers = [SampleType::Bool, SampleType::U8, SampleType::U16].contains(&sample);
+    if reversed && (compression != UNCOMPRESSED || !integers || (bits > 8 && bits != 16)) {
+        let found = format_args!(
+            "reversed bits (FillOrder 2) of {bits}-bit {sample} with compression number {compression}"
+        );
+        return Err(tags.refused(found, ACCEPTED_SAMPLES));
+    }
+    Ok(reversed)
 }
 
 /// Checks that the strips or tiles of a page are inside the file, and can contain the page.
 fn check_chunks<R: Read + Seek>(
     decoder: &mut Decoder<BufReader<R>>,
     page: usize,
-    info: &StackInfo,
+    checked: &Page,
     length: u64,
     limits: &Limits,
 ) -> Result<()> {
@@ -256,13 +384,6 @@ fn check_chunks<R: Read + Seek>(
         .find_tag_unsigned(Tag::Compression)
         .map_err(|e| in_page(page, e))?
         .unwrap_or(UNCOMPRESSED);
-    if !SUPPORTED_COMPRESSIONS.contains(&compression) {
-        return Err(FormatError::Unsupported {
-            format: Format::Tiff,
-            found: format!("compression number {compression} (page {page})"),
-            accepted: ACCEPTED_COMPRESSION,
-        });
-    }
     // The decoder allocates memory for a row of a tile, including the part outside the page.
     let (chunk_width, _) = decoder.chunk_dimensions();
     if u64::from(chunk_width) > 2 * limits.max_side as u64 {
@@ -282,18 +403,12 @@ fn check_chunks<R: Read + Seek>(
         }
         stored = stored.saturating_add(bytes);
     }
-    let needed = match info.sample {
-        SampleType::Bool => (info.width.div_ceil(8) * info.height) as u64,
-        sample => info.voxels() * sample.bytes() as u64,
-    };
+    let needed = (checked.row_bytes() * checked.info.height) as u64;
     let expansion = if compression == UNCOMPRESSED { 1 } else { MAX_EXPANSION };
     if stored.saturating_mul(expansion) < needed {
         return Err(FormatError::Truncated {
             format: Format::Tiff,
-            promised: format!(
-                "{}x{} {} in page {page} ({needed} bytes)",
-                info.height, info.width, info.sample
-            ),
+            promised: format!("{checked} in page {page} ({needed} bytes)"),
             present: format!("{stored} stored bytes for it"),
         });
     }
@@ -315,28 +430,6 @@ fn chunk_ranges<R: Read + Seek>(
             Ok(offsets.into_iter().zip(counts).collect())
         }
         _ => Err(malformed(format!("page {page} does not state the position of its pixels"))),
-    }
-}
-
-fn in_page(page: usize, error: TiffError) -> FormatError {
-    match error {
-        // Decompressors report invalid data as I/O errors, too; only errors of the operating system have a number.
-        TiffError::IoError(source) if source.raw_os_error().is_some() => {
-            FormatError::Io { action: "read the TIFF page", source }
-        }
-        TiffError::IoError(source) if source.kind() == ErrorKind::UnexpectedEof => {
-            FormatError::Truncated {
-                format: Format::Tiff,
-                promised: format!("page {page} (counted from 0)"),
-                present: "only a part of it".to_owned(),
-            }
-        }
-        TiffError::UnsupportedError(feature) => FormatError::Unsupported {
-            format: Format::Tiff,
-            found: format!("page {page}: {feature}"),
-            accepted: ACCEPTED_SAMPLES,
-        },
-        other => malformed(format!("page {page}: {other}")),
     }
 }
 

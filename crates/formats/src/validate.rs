@@ -32,8 +32,8 @@ struct Located {
 /// Reads all masks, passes each one (row, column) on `[0,1]` to `sink`, and returns the statistics.
 ///
 /// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]. After the last mask, so that the message
-/// can contain the largest value: [`FormatError::AboveFullScale`], [`FormatError::AllMasksZero`] and
-/// [`FormatError::MaskFrameZero`]. After an error the output of the sink is invalid.
+/// can contain the largest value: [`FormatError::BipolarMasks`], [`FormatError::AboveFullScale`],
+/// [`FormatError::AllMasksZero`] and [`FormatError::MaskFrameZero`]. After an error the output of the sink is invalid.
 pub fn check_masks(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
@@ -44,7 +44,7 @@ pub fn check_masks(
     let mut open = Array2::from_elem((info.height, info.width), false);
     let (mut clipped_negative, mut sum) = (0, 0.0);
     let mut largest = Located { value: 0.0, frame: 0, row: 0, column: 0 };
-    let mut zero_frames = Vec::new();
+    let (mut zero_frames, mut signs) = (Vec::new(), Signs::default());
     let mut frames = 0;
     while let Some(mut mask) = reader.next_frame()? {
         check_size(&info, frames, &mask)?;
@@ -64,6 +64,7 @@ pub fn check_masks(
             for (value, open) in values.iter_mut().zip(open.iter_mut()) {
                 let scaled = *value / scale;
                 clipped_negative += u64::from(scaled < 0.0);
+                signs.add(*value);
                 // Values above 1 by more than rounding are refused at the end.
                 *value = scaled.clamp(0.0, 1.0);
                 *open |= *value * *value > 0.0;
@@ -77,6 +78,7 @@ pub fn check_masks(
         sink(mask.view())?;
     }
     check_count(info.frames, frames)?;
+    signs.check()?;
     if largest.value / scale > 1.0 + TOLERANCE {
         let Located { value, frame, row, column } = largest;
         return Err(FormatError::AboveFullScale {
@@ -95,6 +97,70 @@ pub fn check_masks(
             clipped_negative,
             mean: sum / info.voxels() as f64,
         }),
+    }
+}
+
+/// Sums over the values on one side of 0.
+#[derive(Debug, Clone, Copy, Default)]
+struct Side {
+    count: u64,
+    sum: f64,
+    squares: f64,
+}
+
+/// Sums over negative and over positive values.
+#[derive(Debug, Default)]
+struct Signs {
+    negative: Side,
+    positive: Side,
+}
+
+/// Bipolar masks have at least this share of negative values. Hadamard patterns have one half.
+const BIPOLAR_SHARE: f64 = 0.05;
+/// The root mean square of the negative values of bipolar masks is at least this share of that of the positive ones.
+const BIPOLAR_LEVEL: f64 = 0.5;
+/// The negative values of bipolar masks spread by less than this share of their mean. Noise has 0.76, because its
+/// values crowd at 0; a uniform distribution has 0.58.
+const BIPOLAR_SPREAD: f64 = 0.65;
+
+impl Signs {
+    fn add(&mut self, value: f32) {
+        let value = f64::from(value);
+        let side = match value {
+            value if value < 0.0 => &mut self.negative,
+            value if value > 0.0 => &mut self.positive,
+            _ => return,
+        };
+        side.count += 1;
+        side.sum += value;
+        side.squares += value * value;
+    }
+
+    /// Refuses masks with positive and negative levels. Noise around 0, as a subtracted dark leaves it, is accepted.
+    fn check(&self) -> Result<()> {
+        let Self { negative, positive } = self;
+        let share = negative.count as f64 / (negative.count + positive.count).max(1) as f64;
+        let (low, high) = (negative.mean(), positive.mean());
+        let spread = (negative.squares / negative.count.max(1) as f64 - low * low).max(0.0).sqrt();
+        let bipolar = positive.count > 0
+            && share >= BIPOLAR_SHARE
+            && negative.rms() >= BIPOLAR_LEVEL * positive.rms()
+            && spread < BIPOLAR_SPREAD * low.abs();
+        if !bipolar {
+            return Ok(());
+        }
+        let percent = (share * 100.0).round();
+        Err(FormatError::BipolarMasks { percent, low: low as f32, high: high as f32 })
+    }
+}
+
+impl Side {
+    fn mean(&self) -> f64 {
+        self.sum / self.count.max(1) as f64
+    }
+
+    fn rms(&self) -> f64 {
+        (self.squares / self.count.max(1) as f64).sqrt()
     }
 }
 

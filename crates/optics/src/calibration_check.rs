@@ -109,7 +109,7 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
         findings.push(Finding::new(
             FindingCode::MaskScale,
             format!(
-                "the largest mask value is {:.3} of the full scale, but should be near 1: the masks probably have \
+                "the largest mask value is {:.4} of the full scale, but should be near 1: the masks probably have \
                  fewer bits than their data type",
                 figures.largest
             ),
@@ -137,25 +137,30 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
     findings
 }
 
-/// Pixels that are dark in every mask, and pixels that are open in every mask.
+/// Pixels that are dark in every mask, and pixels that are open in every mask, if there are more of them than chance
+/// explains. Of independent masks that are half open, one pixel in 2^B is dark in all.
 fn defective_pixels(figures: &MaskFigures) -> Vec<Finding> {
     let mut findings = Vec::new();
     let pixels = figures.gram.len().max(1) as f64;
-    let dead = figures.dead_pixels as f64 / pixels;
-    if dead > 0.001 {
+    let (dead, chance) = (figures.dead_pixels as f64 / pixels, figures.dead_by_chance);
+    if chance.is_exceeded_by(dead) {
         let detail = format!(
-            "{:.2} % of the pixels are dark in every mask and can't be reconstructed",
-            dead * 100.0
+            "{:.2} % of the pixels are dark in every mask and can't be reconstructed; {:.2} % are expected by chance",
+            dead * 100.0,
+            chance.share * 100.0
         );
-        findings.push(Finding::new(FindingCode::DeadPixels, detail).escalate_if(dead > 0.05));
+        let grave = dead - chance.share > 0.05;
+        findings.push(Finding::new(FindingCode::DeadPixels, detail).escalate_if(grave));
     }
-    let stuck = figures.stuck_pixels as f64 / pixels;
-    if stuck > 0.001 && figures.frame_means.len() > 1 {
+    let (stuck, chance) = (figures.stuck_pixels as f64 / pixels, figures.stuck_by_chance);
+    if chance.is_exceeded_by(stuck) && figures.frame_means.len() > 1 {
         findings.push(Finding::new(
             FindingCode::StuckPixels,
             format!(
-                "{:.2} % of the pixels are open in every mask and do not follow the patterns",
-                stuck * 100.0
+                "{:.2} % of the pixels are open in every mask and do not follow the patterns; {:.2} % are expected by \
+                 chance",
+                stuck * 100.0,
+                chance.share * 100.0
             ),
         ));
     }
@@ -353,6 +358,7 @@ mod tests {
     use ndarray::{Array3, Axis, concatenate, s};
 
     use super::judge_masks;
+    use crate::iid::iid_masks;
     use crate::masks::turning_circle;
     use crate::{FindingCode, MaskStudy};
 
@@ -380,6 +386,45 @@ mod tests {
             let first = masks.slice(s![..1, .., ..]);
             let all = concatenate(Axis(0), &[first; 4]).unwrap();
             assert_eq!(repeated(&all), Some(vec![0, 1, 2, 3]), "{count}");
+        }
+    }
+
+    /// The findings on masks [B,H,W].
+    fn codes(masks: &Array3<f32>) -> Vec<FindingCode> {
+        let (frames, height, width) = masks.dim();
+        let mut study = MaskStudy::new(frames, height, width);
+        study.add(masks.view()).unwrap();
+        let findings = judge_masks(&study.finish().unwrap(), None);
+        findings.into_iter().map(|finding| finding.code).collect()
+    }
+
+    /// Squares of `side` pixels, each open in each mask with the probability 1/2.
+    fn random_squares(frames: usize, size: usize, side: usize, seed: u64) -> Array3<f32> {
+        let cells = iid_masks(frames, size / side, size / side, seed).unwrap();
+        Array3::from_shape_fn((frames, size, size), |(k, i, j)| cells[[k, i / side, j / side]])
+    }
+
+    #[test]
+    fn independent_masks_have_no_defective_pixels() {
+        use FindingCode::{DeadPixels, StuckPixels};
+        let defective = |masks: &Array3<f32>| -> Vec<FindingCode> {
+            let mut found = codes(masks);
+            found.retain(|code| [DeadPixels, StuckPixels].contains(code));
+            found
+        };
+        for (frames, side) in [(4, 1), (8, 1), (8, 4), (16, 1), (6, 8)] {
+            for seed in 0..10 {
+                let masks = random_squares(frames, 128, side, seed);
+                assert_eq!(defective(&masks), [], "{frames} {side} {seed}");
+            }
+        }
+        // Dust of 2 % of the area, and hot pixels, are more than chance.
+        for (frames, side) in [(8, 1), (8, 4), (16, 1)] {
+            let mut masks = random_squares(frames, 128, side, 1);
+            masks.slice_mut(s![.., 40..60, 40..58]).fill(0.0);
+            assert_eq!(defective(&masks), [DeadPixels], "{frames} {side}");
+            masks.slice_mut(s![.., 70..90, 40..58]).fill(1.0);
+            assert_eq!(defective(&masks), [DeadPixels, StuckPixels], "{frames} {side}");
         }
     }
 }

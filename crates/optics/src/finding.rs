@@ -168,8 +168,8 @@ impl FindingCode {
                 Warning,
                 Warning,
                 "the largest mask value is far below the full scale",
-                "state the `full_scale` of the masks: 4095 for 12-bit values stored in 16 bits, 16383 for 14-bit \
-                 values",
+                "state the `full_scale` of the masks, not of the measurement: the stored number that means fully open, \
+                 for example 15 for 4-bit values, 4095 for 12-bit values stored in 16 bits",
             ),
             Self::WeakModulation => (
                 &[Calibration],

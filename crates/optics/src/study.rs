@@ -27,6 +27,37 @@ pub struct MaskStudy {
     histogram: Vec<u64>,
     values_at_zero: u64,
     stuck_pixels: u64,
+    /// Counts for each mask \[B\].
+    counts: Vec<PixelCounts>,
+}
+
+/// Counts of the pixels of one mask.
+#[derive(Debug, Clone, Copy, Default)]
+struct PixelCounts {
+    /// Pixels at 0.
+    closed: u64,
+    /// Pixels above [`STUCK_PIXEL`].
+    open: u64,
+    /// Pixels above 0.5.
+    bright: u64,
+    /// Pairs of neighbours in a row with 0.5 between their values.
+    edges: u64,
+}
+
+/// The share of pixels with a property that independent masks have by chance.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Chance {
+    /// Expected share.
+    pub share: f64,
+    /// Standard deviation of the share, for masks of independent squares.
+    pub deviation: f64,
+}
+
+impl Chance {
+    /// True if a share exceeds this one by more than 0.1 % of the pixels and four standard deviations.
+    pub fn is_exceeded_by(&self, share: f64) -> bool {
+        share > self.share + 4.0 * self.deviation + 0.001
+    }
 }
 
 /// Statistics of masks \[B,H,W\] on \[0,1\].
@@ -50,6 +81,10 @@ pub struct MaskFigures {
     pub dead_pixels: u64,
     /// Number of pixels that are open in every mask, and so do not follow the patterns.
     pub stuck_pixels: u64,
+    /// The share of pixels that are dark in every mask by chance.
+    pub dead_by_chance: Chance,
+    /// The share of pixels that are open in every mask by chance.
+    pub stuck_by_chance: Chance,
     /// Number of values that are 0.
     pub values_at_zero: u64,
     /// The largest value.
@@ -106,6 +141,7 @@ impl MaskStudy {
             histogram: vec![0; BINS],
             values_at_zero: 0,
             stuck_pixels: 0,
+            counts: vec![PixelCounts::default(); frames],
         }
     }
 
@@ -131,6 +167,7 @@ impl MaskStudy {
                 let sum = f64::from(mask.sum());
                 self.sums[frame] += sum;
                 self.squared_row_sums[frame] += sum * sum;
+                self.counts[frame].add(mask);
             }
             ndarray::azip!((sum in &mut self.column_sums, &value in &line) *sum += f64::from(value));
             for &value in line {
@@ -143,6 +180,22 @@ impl MaskStudy {
         }
         self.next_row += rows;
         Ok(())
+    }
+
+    /// The share of pixels that have a property in every mask by chance, from the share in each mask.
+    fn chance(&self, count: impl Fn(&PixelCounts) -> u64) -> Chance {
+        let pixels = self.mean.len() as f64;
+        let share: f64 = self.counts.iter().map(|counts| count(counts) as f64 / pixels).product();
+        // Random squares of side s have 2 p (1 - p) / s edges per pixel, where a share p is bright.
+        let (mut edges, mut expected) = (0.0, 0.0);
+        for counts in &self.counts {
+            let bright = counts.bright as f64 / pixels;
+            expected += 2.0 * bright * (1.0 - bright);
+            edges += counts.edges as f64 / pixels;
+        }
+        let side = if edges > 0.0 { (expected / edges).max(1.0) } else { 1.0 };
+        let squares = pixels / (side * side);
+        Chance { share, deviation: (share * (1.0 - share) / squares).sqrt() }
     }
 
     fn add_pixel(&mut self, at: (usize, usize), values: ndarray::ArrayView1<'_, f32>) {
@@ -192,6 +245,8 @@ impl MaskStudy {
             correlation,
             dead_pixels: self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64,
             stuck_pixels: self.stuck_pixels,
+            dead_by_chance: self.chance(|counts| counts.closed),
+            stuck_by_chance: self.chance(|counts| counts.open),
             values_at_zero: self.values_at_zero,
             largest: percentile(&self.histogram, 1.0),
             percentile_1: percentile(&self.histogram, 0.01),
@@ -200,6 +255,21 @@ impl MaskStudy {
             deviation: self.deviation,
             gram: self.gram,
         })
+    }
+}
+
+impl PixelCounts {
+    /// Adds a row of a mask.
+    fn add(&mut self, row: ndarray::ArrayView1<'_, f32>) {
+        let mut previous = None;
+        for &value in row {
+            let bright = value > 0.5;
+            self.closed += u64::from(value <= 0.0);
+            self.open += u64::from(value > STUCK_PIXEL);
+            self.bright += u64::from(bright);
+            self.edges += u64::from(previous.is_some_and(|previous| previous != bright));
+            previous = Some(bright);
+        }
     }
 }
 

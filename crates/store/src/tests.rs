@@ -26,8 +26,8 @@ use super::{
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
-    MeasurementId, MeasurementRequest, ResultFile, Sequence, Sha256, SnapshotSelection, Submission,
-    TaskKind, TaskProgress, ThingId, TileSpec, WorkerId,
+    MeasurementId, MeasurementRequest, Reading, ResultFile, ScaleBasis, Sequence, Sha256,
+    SnapshotSelection, Submission, TaskKind, TaskProgress, ThingId, TileSpec, WorkerId,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -81,6 +81,7 @@ impl Lab {
             dead_pixels: 0,
             clipped_negatives: 0,
             mosaic: None,
+            reading: None,
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();
@@ -104,6 +105,7 @@ impl Lab {
             sequence: Sequence::Separate,
             dark: Vec::new(),
             warnings: Vec::new(),
+            reading: Reading::whole(ScaleBasis::Type),
         };
         let asked = MeasurementRequest::new(None, calibration, data.sha256);
         let passed = Checked::Measurement(facts, upload(b"prepared data"));

@@ -10,12 +10,12 @@ use super::model_process::ModelCommand;
 use super::transport::{Check, TaskError};
 use engine::intake::{self, Exposure, IntakeError, Refusal, RefusalCode, Source, plan};
 use engine::job::{
-    CalibrationRequest, Captures, Label, MeasurementRequest, ModelRequest, Mosaic, Sequence,
-    Sha256, Submission, TaskStage,
+    CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Sequence, Sha256,
+    Submission, TaskStage, keeps_mosaic,
 };
 use engine::pipeline::progress::Monitor;
 use formats::mat::SceneArray;
-use formats::{Axes, FormatError, Limits, StackInfo, StackWriter, planar};
+use formats::{FormatError, Limits, Part, StackInfo, StackWriter, planar};
 use store::{BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, StoreError};
 
 /// Why a check did not pass.
@@ -119,19 +119,6 @@ impl Running<'_> {
         })
     }
 
-    /// Opens an upload as a stack.
-    fn open(
-        &self,
-        file: &std::path::Path,
-        array: SceneArray,
-        (named, axes, full_scale): (Option<&Label>, Option<Axes>, Option<f32>),
-        size: Option<(usize, usize)>,
-    ) -> Result<intake::Opened> {
-        let source = Source::upload(file, array, full_scale, self.limits());
-        let source = source.named(named.map(ToString::to_string)).arranged(axes, size);
-        Ok(source.open()?)
-    }
-
     /// Records the share that was read, on \[0,1\]. Fails if the check was stopped or has passed its deadline.
     fn proceed(&self, share: f64) -> Result<(), FormatError> {
         self.monitor.reach(TaskStage::Reading, share);
@@ -175,13 +162,18 @@ impl Running<'_> {
 
     /// Checks masks and writes them on \[0,1\].
     fn masks(&self, request: &CalibrationRequest) -> Result<Checked> {
-        let CalibrationRequest { name, array, axes, full_scale, mosaic, .. } = request.clone();
+        let CalibrationRequest {
+            name, array, axes, crop, frames, packing, full_scale, mosaic, ..
+        } = request.clone();
         let wrong = || Refusal::new(RefusalCode::InvalidRequest, "name the masks").at("/masks");
         let masks = request.masks.ok_or_else(wrong)?;
         let file = self.upload(masks, "/masks")?;
-        let opened =
-            self.open(&file, SceneArray::Masks, (array.as_ref(), axes, full_scale), None)?;
-        let (info, full_scale) = (opened.info, opened.full_scale.value());
+        let source = Source::upload(&file, SceneArray::Masks, full_scale, self.limits())
+            .named(array.map(|name| name.to_string()))
+            .arranged(axes, None)
+            .part(Part { crop, frames }, packing);
+        let opened = source.open()?;
+        let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         let mut writer = self.writer(&info)?;
         let mut done = 0.0;
         let statistics = intake::masks(opened, |mask| {
@@ -204,6 +196,7 @@ impl Running<'_> {
             dead_pixels: statistics.dead_pixels,
             clipped_negatives: statistics.clipped_negative,
             mosaic,
+            reading: Some(reading),
         };
         Ok(Checked::Masks(facts, writer.finish()?.finish()?))
     }
@@ -222,13 +215,20 @@ impl Running<'_> {
             dark.push(self.upload(*upload, &format!("/dark/{index}"))?);
         }
         let (masks, limits) = (&calibration.facts, self.limits());
-        let layout = (request.array.as_ref(), request.axes, request.full_scale);
-        let size = Some((masks.height, masks.width));
-        let opened = self.open(&file, SceneArray::Measurements, layout, size)?;
-        let (info, full_scale) = (opened.info, opened.full_scale.value());
+        if masks.mosaic.is_some() && !keeps_mosaic(request.crop) {
+            let detail = "the window of a mosaic starts at an even row and an even column";
+            return Err(Refusal::new(RefusalCode::InvalidRequest, detail).at("/crop").into());
+        }
+        let source = Source::upload(&file, SceneArray::Measurements, request.full_scale, limits)
+            .named(request.array.map(|name| name.to_string()))
+            .arranged(request.axes, Some((masks.height, masks.width)))
+            .part(Part { crop: request.crop, frames: None }, request.packing);
+        let opened = source.open()?;
+        let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         if (info.height, info.width) != (masks.height, masks.width) {
             let detail = format!(
-                "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}",
+                "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}: state the window \
+                 that both have in common as `crop`, with the calibration if the masks are larger",
                 info.height, info.width, calibration.id, masks.height, masks.width
             );
             return Err(Refusal::new(RefusalCode::SizeMismatch, detail).at("/data").into());
@@ -266,6 +266,7 @@ impl Running<'_> {
             sequence: request.sequence.unwrap_or(estimated),
             dark: request.dark,
             warnings,
+            reading,
         };
         Ok(Checked::Measurement(facts, staged))
     }

@@ -170,6 +170,7 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
         dead_pixels: report.masks.dead_pixels,
         clipped_negatives: calibrated.clipped_negatives,
         mosaic: None,
+        reading: None,
     }
 }
 

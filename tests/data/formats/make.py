@@ -1,4 +1,4 @@
-"""Makes the files of this folder with the writers that labs use. Needs h5py, numpy, Pillow, SciPy,
+"""Makes the files of this folder with the writers that labs use. Needs h5py, hdf5plugin, numpy, Pillow, SciPy,
 tifffile.
 
 Each holds the same numbers: masks [3, 4, 5] whose value is (frame + 2 row + 3 column) mod 2, or measurements
@@ -8,6 +8,7 @@ Each holds the same numbers: masks [3, 4, 5] whose value is (frame + 2 row + 3 c
 import pathlib
 
 import h5py
+import hdf5plugin
 import numpy as np
 import scipy.io
 import tifffile
@@ -59,6 +60,20 @@ def main():
             file.create_dataset(f"packed/{axes}", data=values, chunks=(2, 2, 2), compression="gzip")
             file[f"matlab/{axes}"] = np.ascontiguousarray(values.T)
             file[f"matlab/{axes}"].attrs["MATLAB_class"] = np.bytes_("uint16")
+    for name, packing in [("lzf", {"compression": "lzf", "shuffle": True}), ("lz4", hdf5plugin.LZ4(nbytes=1024)), ("blosc", hdf5plugin.Blosc())]:
+        with h5py.File(HERE / f"{name}.h5", "w") as file:
+            file.create_dataset("mask", data=np.tile(masks, (1, 8, 8)).astype("<u2"), chunks=(2, 32, 40), **packing)
+    with h5py.File(HERE / "user-block.h5", "w", userblock_size=1024) as file:
+        file["mask"] = masks.astype("u1")
+    with h5py.File(HERE / "groups.h5", "w") as file:
+        file["exchange/data"], file["exchange/dark"] = masks.astype("u1"), masks[:1].astype("u1")
+        # A group that contains itself.
+        file["exchange/again"] = file["exchange"]
+    # Octave stores a variable as a group with its type and its value, whose axes are in reverse.
+    with h5py.File(HERE / "octave.h5", "w") as file:
+        for name, values, kind in [("mask", masks.astype("u1"), "bool matrix"), ("meas", snapshots.astype("f8"), "matrix"), ("shots", snapshots.astype("f8"), "matrix")]:
+            file.create_dataset(f"{name}/type", data=np.bytes_(kind))
+            file[f"{name}/value"] = np.ascontiguousarray(np.moveaxis(values, 0, -1).T)
     scipy.io.savemat(HERE / "names.mat", {"shots": np.moveaxis(snapshots, 0, -1).astype("<u2")})
 
 

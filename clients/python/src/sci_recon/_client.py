@@ -79,6 +79,9 @@ class Client:
         masks_full_scale: float | None = None,
         masks_array: str | None = None,
         masks_axes: str | None = None,
+        masks_crop: Mapping[str, int] | None = None,
+        masks_frames: tuple[int, int] | None = None,
+        masks_packing: str | None = None,
         masks_name: str | None = None,
         mosaic: str | None = None,
         dark: Source | Sequence[Source] = (),
@@ -86,6 +89,8 @@ class Client:
         full_scale: float | None = None,
         array: str | None = None,
         axes: str | None = None,
+        crop: Mapping[str, int] | None = None,
+        packing: str | None = None,
         camera_fps: float | None = None,
         exposure_s: float | None = None,
         sequence: str | None = None,
@@ -113,7 +118,15 @@ class Client:
             calibration = masks
         else:
             calibration = self.calibrate(
-                masks, full_scale=masks_full_scale, array=masks_array, axes=masks_axes, mosaic=mosaic, name=masks_name
+                masks,
+                full_scale=masks_full_scale,
+                array=masks_array,
+                axes=masks_axes,
+                crop=masks_crop,
+                frames=masks_frames,
+                packing=masks_packing,
+                mosaic=mosaic,
+                name=masks_name,
             )
         taken = self.measure(
             calibration,
@@ -123,6 +136,8 @@ class Client:
             full_scale=full_scale,
             array=array,
             axes=axes,
+            crop=crop,
+            packing=packing,
             camera_fps=camera_fps,
             exposure_s=exposure_s,
             sequence=sequence,
@@ -152,14 +167,28 @@ class Client:
         full_scale: float | None = None,
         array: str | None = None,
         axes: str | None = None,
+        crop: Mapping[str, int] | None = None,
+        frames: tuple[int, int] | None = None,
+        packing: str | None = None,
         mosaic: str | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Makes a calibration of masks [B, H, W]; of a colour sensor with a `mosaic`.
 
-        `array` is their name in a file of several arrays.
+        `array` is their name in a file of several arrays. `crop` selects a window with `row`, `column`, `height` and
+        `width`, and `frames` the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed" for
+        12-bit pixels in 3 bytes for 2.
         """
-        given: Record = {"full_scale": full_scale, "array": array, "axes": axes, "mosaic": mosaic, "name": name}
+        given: Record = {
+            "full_scale": full_scale,
+            "array": array,
+            "axes": axes,
+            "crop": crop,
+            "frames": frames,
+            "packing": packing,
+            "mosaic": mosaic,
+            "name": name,
+        }
         record = self._create("calibrations", masks=self.upload(masks), **given)
         return Calibration(self, record).ready()
 
@@ -199,6 +228,8 @@ class Client:
         full_scale: float | None = None,
         array: str | None = None,
         axes: str | None = None,
+        crop: Mapping[str, int] | None = None,
+        packing: str | None = None,
         saturation: int | None = None,
         camera_fps: float | None = None,
         exposure_s: float | None = None,
@@ -208,6 +239,7 @@ class Client:
     ) -> Measurement:
         """Makes a measurement of snapshots [H, W] or [S, H, W] that were taken with a calibration.
 
+        `crop` and `packing` are as for masks, and apply to `dark` too.
         `sequence` is "contiguous" if the snapshots follow one another without a gap, else "separate"; by default the
         camera's times decide.
         """
@@ -220,6 +252,8 @@ class Client:
             full_scale=full_scale,
             array=array,
             axes=axes,
+            crop=crop,
+            packing=packing,
             saturation=saturation,
             camera_fps=camera_fps,
             exposure_s=exposure_s,

@@ -147,7 +147,8 @@ class Watch:
 
 def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
     """Makes the calibration, and returns how files are submitted; `options` are keywords of `Client.reconstruct`."""
-    of_masks = {"masks_full_scale": "full_scale", "masks_array": "array", "masks_axes": "axes", "masks_name": "name"}
+    shared = ("full_scale", "array", "axes", "crop", "frames", "packing", "name")
+    of_masks = {f"masks_{keyword}": keyword for keyword in shared}
     calibration = client.calibrate(
         masks,
         mosaic=options.pop("mosaic", None),

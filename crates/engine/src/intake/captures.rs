@@ -157,7 +157,8 @@ fn average_masks(
         let whole = |share: f64| (f64::from(done) + share) / total as f64 * AVERAGING_SHARE;
         let place = |index| format!("captures of {name}, file {}", index + 1);
         let mut report = |share| progress(whole(share));
-        let averaged = average(paths, files.saturation, limits, place, &mut report);
+        let open = |path: &Path| formats::open_stack(path, limits);
+        let averaged = average(paths, files.saturation, open, place, &mut report);
         done += 1;
         averaged
     };
@@ -197,21 +198,21 @@ fn average_masks(
     Ok(Captured { scale, figures, illumination, sample, clipped_negatives: clipped })
 }
 
-/// Averages all frames of some files. `place` names a file in errors, by its index.
+/// Averages all frames of some files, which `open` opens. `place` names a file in errors, by its index.
 pub(super) fn average(
     paths: &[PathBuf],
     saturation: Option<u32>,
-    limits: &Limits,
+    open: impl Fn(&Path) -> Result<Box<dyn FrameReader + Send>, FormatError>,
     place: impl Fn(usize) -> String,
     progress: &mut Progress<'_>,
 ) -> Result<(Average, SampleType)> {
     let (mut repeats, mut sample) = (None, SampleType::F32);
     for (index, path) in paths.iter().enumerate() {
         let failed = |source| IntakeError::format(place(index))(source);
-        let mut reader = formats::open_stack(path, limits).map_err(failed)?;
+        let mut reader = open(path).map_err(failed)?;
         let info = *reader.info();
         sample = info.sample;
-        let level = saturation_level(sample, saturation);
+        let level = saturation_level(&info, saturation);
         let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, level));
         let mut frame = 0;
         while let Some(capture) = reader.next_frame().map_err(failed)? {
@@ -226,13 +227,11 @@ pub(super) fn average(
     Ok((average.map_err(|error| IntakeError::content(place(0), &error))?, sample))
 }
 
-/// Stored value from which a pixel is saturated: the stated one, or the largest of the data type. Floats have no such
+/// Stored value from which a pixel is saturated: the stated one, or the largest of the file. Floats have no such
 /// default.
 #[allow(clippy::cast_precision_loss)] // camera values are small
-pub(super) fn saturation_level(sample: SampleType, stated: Option<u32>) -> Option<f32> {
-    let largest = sample.default_full_scale().filter(|largest| *largest != FullScale::ONE);
-    let largest = largest.map(FullScale::value);
-    stated.map(|value| value as f32).or(largest)
+pub(super) fn saturation_level(info: &StackInfo, stated: Option<u32>) -> Option<f32> {
+    stated.map(|value| value as f32).or(info.largest)
 }
 
 /// Reports the finished share of the work. Errors: [`IntakeError::Stopped`].

@@ -12,10 +12,13 @@ use super::IntakeError;
 use super::captures::{average, saturation_level};
 use super::open::Opened;
 use crate::intake::error::Result;
-use crate::job::{Finding, FindingCode, MAX_MASKS, Mosaic};
+use crate::job::{Finding, FindingCode, MAX_MASKS, Mosaic, Reading};
+use formats::mat::SceneArray;
 use formats::planar::Reader;
 use formats::validate::{MaskStatistics, check_masks, check_snapshots};
-use formats::{self, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use formats::{
+    self, Expected, FormatError, FrameReader, Limits, Part, SampleType, StackInfo, Wanted,
+};
 use optics::{BitUsage, MeasurementStudy, REACH, judge_measurement};
 
 /// Side of a checked window without its margin, in pixels.
@@ -66,7 +69,7 @@ fn check_count(opened: &Opened) -> Result<()> {
     let order = axes.map(|axes| format!(", read as {axes}")).unwrap_or_default();
     let detail = format!(
         "the file has {frames} masks of {height}x{width} (rows x columns{order}); a calibration has at most \
-         {MAX_MASKS}: send one mask per frame of an exposure, or state `axes`"
+         {MAX_MASKS}: state the first and the last one of an exposure as `frames`, or the order as `axes`"
     );
     Err(IntakeError::Size { place: opened.name.clone(), detail })
 }
@@ -82,9 +85,9 @@ pub fn measurement(
     limits: &Limits,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
 ) -> Result<Passed> {
-    let Opened { info, full_scale, reader, name } = opened;
-    let dark = average_dark(&exposure.dark, (info.height, info.width), limits)?;
-    let saturation = saturation_level(info.sample, exposure.saturation);
+    let Opened { info, full_scale, reading, reader, name } = opened;
+    let dark = average_dark(&exposure.dark, (info.height, info.width), reading, limits)?;
+    let saturation = saturation_level(&info, exposure.saturation);
     let bits = (info.sample == SampleType::U16).then(BitUsage::default);
     let mut exposed = DarkCorrected { reader, dark, saturation, saturated: Vec::new(), bits };
     check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
@@ -93,19 +96,29 @@ pub fn measurement(
     Ok(Passed { saturated: saturation.map(|_| exposed.saturated), findings })
 }
 
-/// Averages dark frames \[H,W\], as stored. `None` if there are none.
+/// Averages dark frames \[H,W\], as stored. They are cropped and packed like the measurement. `None` if there are none.
 fn average_dark(
     dark: &[PathBuf],
     (height, width): (usize, usize),
+    reading: Reading,
     limits: &Limits,
 ) -> Result<Option<Array2<f32>>> {
     if dark.is_empty() {
         return Ok(None);
     }
     let place = |index| format!("/dark/{index}");
+    let part = Part { crop: reading.crop, frames: None };
+    let open = |path: &Path| match (reading.crop, reading.packing) {
+        (None, None) => formats::open_stack(path, limits),
+        (crop, packing) => {
+            let size = crop.is_none().then_some((height, width));
+            let expected = Expected { size, ..Expected::default() };
+            let wanted = Wanted { part, packing, expected, ..SceneArray::Measurements.into() };
+            formats::open_array(path, wanted, limits)
+        }
+    };
     for (index, path) in dark.iter().enumerate() {
-        let opened = formats::open_stack(path, limits);
-        let info = *opened.map_err(IntakeError::format(place(index)))?.info();
+        let info = *open(path).map_err(IntakeError::format(place(index)))?.info();
         if (info.height, info.width) != (height, width) {
             let detail = format!(
                 "the dark frames are {}x{} (rows x columns), but the measurement is {height}x{width}: both must have \
@@ -115,7 +128,7 @@ fn average_dark(
             return Err(IntakeError::Size { place: place(index), detail });
         }
     }
-    Ok(Some(average(dark, None, limits, place, &mut |_| true)?.0.mean))
+    Ok(Some(average(dark, None, open, place, &mut |_| true)?.0.mean))
 }
 
 /// A reader that subtracts dark frames and counts saturated pixels.

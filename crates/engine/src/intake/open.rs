@@ -6,10 +6,11 @@ use ndarray::Array2;
 
 use super::IntakeError;
 use crate::intake::error::Result;
-use crate::job::MAX_MASKS;
+use crate::job::{MAX_MASKS, Reading, ScaleBasis};
 use formats::mat::SceneArray;
 use formats::{
-    self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, StackInfo, Wanted,
+    self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, Packing, Part, SampleType,
+    StackInfo, Wanted,
 };
 
 /// A file, and the array in it if it has several.
@@ -23,6 +24,10 @@ pub struct Source<'a> {
     pub axes: Option<Axes>,
     /// Expected rows and columns of a frame, if known.
     pub size: Option<(usize, usize)>,
+    /// The part that is read.
+    pub part: Part,
+    /// How pixels are packed; `None` for one number per pixel.
+    pub packing: Option<Packing>,
     /// Stored value that means 1; `None` for the default of the file.
     pub full_scale: Option<f32>,
     pub limits: Limits,
@@ -34,6 +39,8 @@ pub struct Source<'a> {
 pub struct Opened {
     pub info: StackInfo,
     pub full_scale: FullScale,
+    /// The part of the file and the reason for the full scale.
+    pub reading: Reading,
     pub(super) reader: Box<dyn FrameReader + Send>,
     pub(super) name: String,
 }
@@ -58,7 +65,8 @@ impl<'a> Source<'a> {
         limits: Limits,
     ) -> Self {
         let (named, axes, size, name) = (None, None, None, String::new());
-        Self { path, array, named, axes, size, full_scale, limits, name }
+        let (part, packing) = (Part::default(), None);
+        Self { path, array, named, axes, size, part, packing, full_scale, limits, name }
     }
 
     /// Selects the array with this name.
@@ -71,16 +79,56 @@ impl<'a> Source<'a> {
         Self { axes, size, ..self }
     }
 
-    /// Opens the file.
+    /// Selects a part of the file, and states how its pixels are packed.
+    pub fn part(self, part: Part, packing: Option<Packing>) -> Self {
+        Self { part, packing, ..self }
+    }
+
+    /// Opens the file. Masks of integers that are all 0 or 1 are closed and open, whatever their type.
     ///
     /// Errors: [`IntakeError::Format`] if the file is missing, unsupported or larger than the limits, if it does not
     /// have the array, if several orders of its axes fit, or if the full scale is unknown.
     pub fn open(&self) -> Result<Opened> {
-        let max_frames = (self.array == SceneArray::Masks).then_some(MAX_MASKS);
-        let expected = Expected { axes: self.axes, max_frames, size: self.size };
-        let wanted = Wanted { array: self.array, name: self.named.as_deref(), expected };
+        let mut opened = self.with_full_scale(self.open_array()?)?;
+        let is_default = opened.reading.scale_basis == ScaleBasis::Type;
+        let integers = !matches!(
+            opened.info.sample,
+            SampleType::Bool | SampleType::F16 | SampleType::F32 | SampleType::F64
+        );
+        // Too many masks are refused without a look at their values.
+        let masks = self.array == SceneArray::Masks && opened.info.frames <= MAX_MASKS;
+        if masks && is_default && integers && self.is_binary()? {
+            opened.full_scale = FullScale::ONE;
+            opened.reading.scale_basis = ScaleBasis::Values;
+        }
+        Ok(opened)
+    }
+
+    fn open_array(&self) -> Result<Box<dyn FrameReader + Send>> {
+        // A larger file may have the selected frames.
+        let limited = self.array == SceneArray::Masks && self.part.frames.is_none();
+        let size = self.size.filter(|_| self.part.crop.is_none());
+        let expected = Expected { axes: self.axes, max_frames: limited.then_some(MAX_MASKS), size };
+        let wanted = Wanted {
+            array: self.array,
+            name: self.named.as_deref(),
+            expected,
+            part: self.part,
+            packing: self.packing,
+        };
         let opened = formats::open_array(self.path, wanted, &self.limits);
-        self.with_full_scale(opened.map_err(IntakeError::format(&self.name))?)
+        opened.map_err(IntakeError::format(&self.name))
+    }
+
+    /// True if all values are 0 or 1. Reads the file up to the first other value.
+    fn is_binary(&self) -> Result<bool> {
+        let mut reader = self.open_array()?;
+        while let Some(frame) = reader.next_frame().map_err(IntakeError::format(&self.name))? {
+            if frame.iter().any(|value| *value != 0.0 && *value != 1.0) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
     }
 
     /// Opens a colour clip with frames \[H,3W\], which interleave red, green and blue. `None` if the file is not in
@@ -95,6 +143,13 @@ impl<'a> Source<'a> {
 
     fn with_full_scale(&self, reader: Box<dyn FrameReader + Send>) -> Result<Opened> {
         let info = *reader.info();
+        let basis = self.full_scale.map_or(ScaleBasis::Type, |_| ScaleBasis::Stated);
+        let reading = Reading {
+            scale_basis: basis,
+            crop: self.part.crop,
+            frames: self.part.frames,
+            packing: self.packing,
+        };
         let full_scale = match (self.full_scale, info.default_full_scale) {
             (Some(value), _) => FullScale::new(value),
             (None, Some(default)) => Ok(default),
@@ -103,7 +158,7 @@ impl<'a> Source<'a> {
             (None, None) => Err(FormatError::FullScaleNeeded(info.sample.to_string())),
         };
         let full_scale = full_scale.map_err(IntakeError::format(&self.name))?;
-        Ok(Opened { info, full_scale, reader, name: self.name.clone() })
+        Ok(Opened { info, full_scale, reading, reader, name: self.name.clone() })
     }
 }
 

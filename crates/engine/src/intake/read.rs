@@ -11,7 +11,7 @@ use super::check::{Exposure, Passed, masks, measurement};
 use super::open::{Opened, Source};
 use crate::intake::error::Result;
 use formats::mat::SceneArray;
-use formats::{Axes, Channels, FormatError};
+use formats::{Axes, Channels, FormatError, natural_key};
 
 /// An array divided by its full scale.
 #[derive(Debug)]
@@ -125,8 +125,8 @@ pub fn read_truth(
     Ok(Some((truth.slice(s![first..first + needed, .., ..]).to_owned(), channels)))
 }
 
-/// Reads frames \[T,H,W\], divided by the full scale, from a file, or from a folder of PNG pictures in the order of
-/// their names.
+/// Reads frames \[T,H,W\], divided by the full scale, from a file, or from a folder of PNG pictures in the natural order
+/// of their names.
 ///
 /// Errors: as [`Source::open`]; [`IntakeError::Content`] for values that are not finite, and for pictures of different
 /// sizes.
@@ -167,7 +167,8 @@ fn clip(
             files.push(file);
         }
     }
-    files.sort();
+    let name = |file: &PathBuf| file.file_name().map(|name| name.to_string_lossy().into_owned());
+    files.sort_by_cached_key(|file| natural_key(&name(file).unwrap_or_default()));
     let mut stack = Stack::default();
     for file in &files {
         let picture = read_frames(&source(file))?;

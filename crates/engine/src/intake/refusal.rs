@@ -88,6 +88,9 @@ impl TryFrom<FormatError> for Refusal {
             FormatError::FullScale(_) => Some("/full_scale"),
             FormatError::AxesAmbiguous { .. } | FormatError::NoAxes(_) => Some("/axes"),
             FormatError::NoNames | FormatError::MissingArray { .. } => Some("/array"),
+            FormatError::Part { field: "crop", .. } => Some("/crop"),
+            FormatError::Part { field: "frames", .. } => Some("/frames"),
+            FormatError::Part { .. } => Some("/packing"),
             _ => None,
         };
         Ok(Self {

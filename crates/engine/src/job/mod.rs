@@ -8,6 +8,7 @@ mod ids;
 mod memory;
 mod model;
 mod pool;
+mod reading;
 mod report;
 mod request;
 mod shape;
@@ -27,6 +28,7 @@ pub use ids::{
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{MARGIN, Mosaic};
 pub use pool::{InvalidPool, Pool};
+pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
 pub use report::{
     CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, PatternReport,

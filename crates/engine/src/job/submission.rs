@@ -2,8 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::reading::keeps_mosaic;
 use super::{CalibrationId, Captures, InvalidField, Label, Mosaic, Sequence, Sha256};
-use formats::{Axes, FullScale};
+use formats::{Axes, Crop, FullScale, Packing};
 
 /// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
 const CHECK_S: f64 = 20e-9;
@@ -25,9 +26,18 @@ pub struct CalibrationRequest {
     /// Order of the array's axes; without it, the only one that fits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
-    /// The stored number that means 1. By default 255 for uint8, 65535 for uint16, and 1 for floats and truth values; in
-    /// `.mat` files 1 for `mask` and 255 for `meas`. Masks of other integers must be 0 or 1; measurements of other integers
-    /// need it.
+    /// Window of each mask; by default the whole masks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub crop: Option<Crop>,
+    /// First and last mask, both included, counted from 0; by default all masks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frames: Option<(usize, usize)>,
+    /// How the pixels are packed; by default one number per pixel.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub packing: Option<Packing>,
+    /// The stored number that means 1. By default 255 for uint8, 65535 for uint16, the largest value of TIFF samples with
+    /// fewer bits, and 1 for floats and truth values; for the arrays of that name in files of MATLAB and Octave 1 for `mask`
+    /// and 255 for `meas`. Other integers need it. Masks of integers that are all 0 or 1 are closed and open in any type.
     #[schemars(range(min = 1.2e-38, max = 3.4e38))]
     pub full_scale: Option<f32>,
     pub captures: Option<Captures>,
@@ -50,6 +60,12 @@ pub struct MeasurementRequest {
     /// Order of the array's axes; without it, the only one that fits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
+    /// Window of each snapshot and dark frame; by default whole snapshots.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub crop: Option<Crop>,
+    /// How the pixels of data and dark frames are packed; by default one number per pixel.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub packing: Option<Packing>,
     /// Captures with the LCoS all black, at the measurement's exposure. The average of the captures is subtracted.
     #[serde(default)]
     #[schemars(length(max = 4096))]
@@ -57,8 +73,8 @@ pub struct MeasurementRequest {
     /// Smallest stored number of a saturated pixel.
     #[schemars(range(min = 1))]
     pub saturation: Option<u32>,
-    /// The stored number that means 1. By default 255 for uint8, 65535 for uint16, and 1 for floats and truth values; in
-    /// `.mat` files 1 for `mask` and 255 for `meas`. Masks of other integers must be 0 or 1; measurements of other integers
+    /// The stored number that means 1. By default 255 for uint8, 65535 for uint16, the largest value of TIFF samples with
+    /// fewer bits, and 1 for floats and truth values; for the array `meas` in files of MATLAB and Octave 255. Other integers
     /// need it.
     #[schemars(range(min = 1.2e-38, max = 3.4e38))]
     pub full_scale: Option<f32>,
@@ -175,12 +191,24 @@ impl CalibrationRequest {
     fn check(&self) -> Result<(), Vec<InvalidField>> {
         let wrong = |pointer: &str, detail: &str| Err(vec![InvalidField::new(pointer, detail)]);
         match (&self.masks, &self.captures) {
+            (Some(_), None) if self.mosaic.is_some() && !keeps_mosaic(self.crop) => {
+                wrong("/crop", "the window of a mosaic starts at an even row and an even column")
+            }
             (Some(_), None) => Ok(()),
             (None, Some(_)) if self.array.is_some() => {
                 wrong("/array", "captures are pictures, not named arrays")
             }
             (None, Some(_)) if self.axes.is_some() => {
                 wrong("/axes", "captures are [frame, row, column]: leave axes out")
+            }
+            (None, Some(_)) if self.crop.is_some() => {
+                wrong("/crop", "captures are used as a whole: crop the files")
+            }
+            (None, Some(_)) if self.frames.is_some() => {
+                wrong("/frames", "captures are used as a whole: list the files that are needed")
+            }
+            (None, Some(_)) if self.packing.is_some() => {
+                wrong("/packing", "captures have one number per pixel")
             }
             (None, Some(_)) if self.full_scale.is_some() => wrong(
                 "/full_scale",
@@ -201,6 +229,8 @@ impl MeasurementRequest {
             data,
             array: None,
             axes: None,
+            crop: None,
+            packing: None,
             dark: Vec::new(),
             saturation: None,
             full_scale: None,

@@ -57,6 +57,65 @@ fn arrays_are_read_by_name_and_errors_list_the_names() {
 }
 
 #[test]
+fn plug_in_compressions_of_h5py_are_read_or_refused_with_a_line() {
+    let tiled = Array3::from_shape_fn((3, 32, 40), |(k, i, j)| masks()[[k, i % 4, j % 5]]);
+    for name in ["lzf.h5", "lz4.h5"] {
+        let (info, values) = read(name, SceneArray::Masks).unwrap();
+        assert_eq!((info.sample, values), (SampleType::U16, tiled.clone()), "{name}");
+    }
+    let error = read("blosc.h5", SceneArray::Masks).unwrap_err();
+    assert_eq!(error.code(), "unsupported_content");
+    let line =
+        "import hdf5plugin, h5py, numpy; numpy.save('out.npy', h5py.File('in.h5')['mask'][()])";
+    assert_names(&error.to_string(), &["filter id 32001", line]);
+}
+
+#[test]
+fn files_with_a_user_block_are_read() {
+    assert_eq!(read("user-block.h5", SceneArray::Masks).unwrap().1, masks());
+}
+
+#[test]
+fn arrays_in_groups_are_listed_by_their_paths() {
+    let open = |name: &str| {
+        let wanted = Wanted { name: Some(name), ..SceneArray::Masks.into() };
+        collect(&mut *open_array(&sample("groups.h5"), wanted, &Limits::default())?)
+    };
+    for name in ["mask", "exchange", "exchange/mask", "exchange/data/more"] {
+        let error = open(name).unwrap_err();
+        assert_eq!(error.code(), "missing_array", "{error}");
+        assert_names(&error.to_string(), &["'exchange/data'", "'exchange/dark'", "`array`"]);
+    }
+    for name in ["exchange/data", "/exchange/data", "exchange/again/data"] {
+        assert_eq!(open(name).unwrap().1, masks(), "{name}");
+    }
+}
+
+#[test]
+fn variables_of_octave_are_read() {
+    let (info, values) = read("octave.h5", SceneArray::Masks).unwrap();
+    assert_eq!((info.sample, values), (SampleType::Bool, masks()));
+    let (info, values) = read("octave.h5", SceneArray::Measurements).unwrap();
+    assert_eq!((info.default_full_scale, values), (Some(FullScale::EIGHT_BIT), snapshots()));
+    // Arrays with other names do not have the scales of the public scenes.
+    for name in ["shots", "shots/value"] {
+        let wanted = Wanted { name: Some(name), ..SceneArray::Measurements.into() };
+        let mut reader = open_array(&sample("octave.h5"), wanted, &Limits::default()).unwrap();
+        let (info, values) = collect(&mut *reader).unwrap();
+        assert_eq!((info.default_full_scale, values), (Some(FullScale::ONE), snapshots()));
+    }
+}
+
+#[test]
+fn lines_of_python_have_plain_names_only() {
+    for (name, shown) in
+        [("run 2/C_k", "run 2/C_k"), ("a'b", "NAME"), ("$(x)", "NAME"), ("\"", "NAME")]
+    {
+        assert_eq!(super::python_name(name), shown);
+    }
+}
+
+#[test]
 fn all_orders_of_axes_are_read() {
     for name in Axes::VARIANTS {
         let axes: Axes = name.parse().unwrap();
@@ -64,7 +123,7 @@ fn all_orders_of_axes_are_read() {
             let name = format!("{place}{axes}");
             let expected = Expected { axes: Some(axes), ..Expected::default() };
             let array = SceneArray::Measurements;
-            let wanted = Wanted { array, name: Some(&name), expected };
+            let wanted = Wanted { name: Some(&name), expected, ..array.into() };
             let reader = open_array(&sample("axes.h5"), wanted, &Limits::default());
             let (info, values) = collect(&mut *reader.unwrap()).unwrap();
             assert_eq!((info.axes, values), (Some(axes), snapshots()), "{name}");
@@ -118,7 +177,7 @@ proptest! {
     /// Any values are acceptable, but an error must blame the file.
     #[test]
     fn damaged_files_are_read_or_refused(
-        name in prop::sample::select(vec!["h5py.h5", "types.h5", "matlab73.mat"]),
+        name in prop::sample::select(vec!["h5py.h5", "types.h5", "matlab73.mat", "lzf.h5", "lz4.h5", "octave.h5", "groups.h5"]),
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..8),
         keep in any::<prop::sample::Index>(),
         cut in any::<bool>(),

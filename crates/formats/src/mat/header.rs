@@ -4,6 +4,7 @@ use std::io::BufRead;
 
 use super::element::{Content, malformed};
 use crate::error::Result;
+use crate::hdf5::python_name;
 use crate::samples::ByteOrder;
 use crate::{Format, FormatError, SampleType};
 
@@ -60,16 +61,18 @@ impl ArrayHeader {
 
     /// The data type of the array. Errors: [`FormatError::Unsupported`] for other classes.
     pub(super) fn sample_type(&self) -> Result<SampleType> {
+        let name = python_name(&self.name);
         let refused = match self.class {
             // A sparse matrix may also be complex, so it is checked first.
-            5 => {
+            5 => format!(
                 "a sparse matrix (to convert it: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
-                 scipy.io.loadmat('in.mat')['mask'].toarray())\")"
-            }
-            _ if self.flags & COMPLEX != 0 => {
-                "complex numbers (to convert to absolute values: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
-                 numpy.moveaxis(abs(scipy.io.loadmat('in.mat')['mask']), -1, 0))\")"
-            }
+                 scipy.io.loadmat('in.mat')['{name}'].toarray())\")"
+            ),
+            _ if self.flags & COMPLEX != 0 => format!(
+                "complex numbers (to convert to absolute values: python -c \"import numpy, scipy.io; a = \
+                 abs(scipy.io.loadmat('in.mat')['{name}']); numpy.save('out.npy', numpy.moveaxis(a, -1, 0) if a.ndim > 2 \
+                 else a)\")"
+            ),
             6 => return Ok(SampleType::F64),
             7 => return Ok(SampleType::F32),
             9 if self.flags & LOGICAL != 0 => return Ok(SampleType::Bool),
@@ -81,17 +84,18 @@ impl ArrayHeader {
             13 => return Ok(SampleType::U32),
             14 => return Ok(SampleType::I64),
             15 => return Ok(SampleType::U64),
-            1 => {
+            1 => format!(
                 "a cell array (to convert cells with one frame each: python -c \"import numpy, scipy.io; numpy.save('out.npy', \
-                 numpy.stack(list(scipy.io.loadmat('in.mat')['mask'].ravel())))\")"
-            }
-            2 => {
-                "a struct (to convert its first field: python -c \"import numpy, scipy.io; s = scipy.io.loadmat('in.mat', \
-                 simplify_cells=True)['mask']; numpy.save('out.npy', numpy.moveaxis(list(s.values())[0], -1, 0))\")"
-            }
-            3 => "an object",
-            4 => "text",
-            _ => "an array of an unknown class",
+                 numpy.stack(list(scipy.io.loadmat('in.mat')['{name}'].ravel())))\")"
+            ),
+            2 => format!(
+                "a struct (to convert its first array: python -c \"import numpy, scipy.io; s = scipy.io.loadmat('in.mat', \
+                 simplify_cells=True)['{name}']; a = next(v for v in s.values() if numpy.ndim(v) > 1); \
+                 numpy.save('out.npy', numpy.moveaxis(a, -1, 0) if a.ndim > 2 else a)\")"
+            ),
+            3 => "an object".to_owned(),
+            4 => "text".to_owned(),
+            _ => "an array of an unknown class".to_owned(),
         };
         Err(FormatError::Unsupported {
             format: Format::Mat,

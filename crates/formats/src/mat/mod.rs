@@ -18,6 +18,7 @@ use header::{ArrayHeader, read_data_tag};
 
 use super::array::{self, ArrayReader, Samples};
 use super::axes::{Expected, Layout, Writer};
+use super::hdf5::python_name;
 use super::samples::{self, ByteOrder};
 pub use super::scene::SceneArray;
 use super::scene::list;
@@ -40,8 +41,10 @@ pub(super) fn open(
         if header.name == name {
             let order = elements.order();
             let content = elements.into_content(element)?;
+            // Arrays with other names do not have the scales of the public scenes.
+            let scene = (name == array.name()).then_some(array);
             let (samples, info, layout) =
-                MatSamples::new((content, again), (element, order), (array, expected), limits)?;
+                MatSamples::new((content, again), (element, order), (scene, expected), limits)?;
             return Ok(Box::new(ArrayReader::new(samples, info, layout)));
         }
         present.push(header.name);
@@ -64,7 +67,7 @@ impl MatSamples {
     fn new(
         (mut content, file): (Content<BufReader<File>>, File),
         (element, order): (Element, ByteOrder),
-        (array, expected): (SceneArray, &Expected),
+        (scene, expected): (Option<SceneArray>, &Expected),
         limits: &Limits,
     ) -> Result<(Self, StackInfo, Layout)> {
         let header = ArrayHeader::read(&mut content)?;
@@ -74,17 +77,22 @@ impl MatSamples {
             format: Format::Mat,
             found: format!(
                 "'{}' with {} dimensions (to convert it to a stack of pictures: python -c \"import numpy, scipy.io; \
-                 a = scipy.io.loadmat('in.mat')['mask']; numpy.save('out.npy', \
+                 a = scipy.io.loadmat('in.mat')['{}']; numpy.save('out.npy', \
                  numpy.moveaxis(a.reshape(*a.shape[:2], -1, order='F'), -1, 0))\")",
                 header.name,
-                header.dimensions.len()
+                header.dimensions.len(),
+                python_name(&header.name)
             ),
             accepted: "(row, column, frame) or (row, column)",
         })?;
         let info = array::info(Format::Mat, sample, &arranged, limits)?;
         let (storage, bytes) = read_data_tag(&mut content, &header)?;
         content.check_can_hold(&header.name, bytes)?;
-        let info = StackInfo { default_full_scale: Some(array.default_full_scale()), ..info };
+        let default_full_scale = match scene {
+            Some(array) => Some(array.default_full_scale()),
+            None => info.default_full_scale,
+        };
+        let info = StackInfo { default_full_scale, ..info };
         Ok((Self { content, file, element, order, storage }, info, arranged.layout))
     }
 }

@@ -2,7 +2,7 @@ use ::zip::write::SimpleFileOptions;
 use ndarray::Array3;
 use proptest::prelude::{any, proptest};
 
-use super::split;
+use super::Parts;
 use crate::npz::tests::archive;
 use crate::test_support::{assert_names, file, ramp, read, read_as, refusal, sample, survive};
 use crate::{Axes, Channels, Format, Limits, SampleType, open_stack, png};
@@ -75,7 +75,10 @@ fn hidden_files_are_skipped_and_other_files_refused() {
     };
     let mut members = several(&["a1.png", "a2.png"]);
     members.push(("__MACOSX/._a1.png", b"no picture".to_vec()));
-    members.push((".DS_Store", b"no picture".to_vec()));
+    for name in [".DS_Store", "README.txt", "ReadMe", "Thumbs.db", "scan/desktop.ini", "camera.xml"]
+    {
+        members.push((name, b"no picture".to_vec()));
+    }
     assert_eq!(read(&zipped(&members)).unwrap().0.frames, 2);
     for (names, words) in [
         (
@@ -85,9 +88,13 @@ fn hidden_files_are_skipped_and_other_files_refused() {
         (&["a1.png", "a01.png"], &["same number"]),
         (&["a1.png", "b2.png"], &["'b2.png' among 'aN.png'"]),
         (&["a1.png", "a2.PNG"], &["'a2.PNG'"]),
-        (&["a1.png", "read me.png"], &["'read me.png'", "has no number"]),
+        (&["a1.png", "overview.png"], &["'overview.png'", "has no number"]),
         (&["a1/mask.png"], &["has no number"]),
-        (&["a99999999999999999999.png"], &["has no number"]),
+        (&["a9999999999999999999999999999999999999999.png"], &["has no number"]),
+        (&["a1_b2.png", "a2_b1.png"], &["'a1_b2.png'", "one number in the names rises"]),
+        (&["a1_b1.png", "a2_b1.png", "a1_b2.png", "a2_b2.png"], &["same number"]),
+        (&["a1.png", "a2.png", "a4_1.png"], &["'a4_1.png' among 'aN.png'"]),
+        (&["a10_1.png", "a20_3.png"], &["'a20_3.png' after 'a10_1.png'", "missing"]),
     ] {
         let message = refusal(&zipped(&several(names)));
         assert_names(&message, words);
@@ -95,8 +102,8 @@ fn hidden_files_are_skipped_and_other_files_refused() {
     }
     assert_names(&refusal(&zipped(&[])), &["no pictures"]);
     assert_names(
-        &refusal(&zipped(&[("a1.txt", b"text".to_vec())])),
-        &["'a1.txt'", "neither PNG nor TIFF"],
+        &refusal(&zipped(&[("a1.jpg", b"text".to_vec())])),
+        &["'a1.jpg'", "neither PNG nor TIFF"],
     );
     let pages = std::fs::read(sample("masks-bool.tif")).unwrap();
     assert_names(&refusal(&zipped(&[("a1.tif", pages)])), &["3 pages"]);
@@ -140,13 +147,32 @@ fn tar_lengths_and_checksums_are_verified() {
 }
 
 #[test]
-fn the_last_number_of_a_name_determines_the_order() {
-    assert_eq!(split("a/b2_003.tif"), Some(("a/b2_", 3, ".tif")));
-    assert_eq!(split("17"), Some(("", 17, "")));
-    assert_eq!(split("mp4.png"), Some(("mp", 4, ".png")));
-    assert_eq!(split("ä1.png"), Some(("ä", 1, ".png")));
-    for name in ["", "a.png", "a.7", "1/a.png", "a99999999999999999999.png"] {
-        assert_eq!(split(name), None, "{name}");
+fn names_are_split_at_the_numbers_of_the_file() {
+    let parts = |name: &'static str| Parts::of(name).map(|parts| (parts.texts, parts.numbers));
+    assert_eq!(parts("a7/b2_003.tif"), Some((vec!["a7/b", "_", ".tif"], vec![2, 3])));
+    assert_eq!(parts("17"), Some((vec!["", ""], vec![17])));
+    assert_eq!(parts("mp4.png"), Some((vec!["mp", ".png"], vec![4])));
+    assert_eq!(parts("ä1.png"), Some((vec!["ä", ".png"], vec![1])));
+    for name in ["", "a.png", "a.7", "1/a.png", "a9999999999999999999999999999999999999999.png"] {
+        assert_eq!(parts(name), None, "{name}");
+    }
+}
+
+#[test]
+fn a_second_counter_may_rise_with_the_first() {
+    let stack = ramp((3, 4, 5), 200);
+    let pngs = pictures(&stack);
+    for names in [
+        ["f1_t0.png", "f2_t250.png", "f3_t1000.png"],
+        ["t090_1.png", "t100_2.png", "t110_3.png"],
+        [
+            "cam1_20260131_235959.9_1.png",
+            "cam1_20260201_000000.1_2.png",
+            "cam1_20260201_000000.3_3.png",
+        ],
+    ] {
+        let members: Vec<_> = [2, 0, 1].map(|k| (names[k], pngs[k].clone())).into();
+        assert_eq!(read(&zipped(&members)).unwrap().1, stack, "{names:?}");
     }
 }
 
@@ -164,8 +190,9 @@ proptest! {
 
     #[test]
     fn splitting_never_panics(name in ".{0,20}") {
-        if let Some((before, _, after)) = split(&name) {
-            assert!(name.starts_with(before) && name.ends_with(after));
+        if let Some(Parts { texts, numbers }) = Parts::of(&name) {
+            assert_eq!(texts.len(), numbers.len() + 1);
+            assert!(name.starts_with(texts[0]) && name.ends_with(texts[numbers.len()]));
         }
     }
 }

@@ -65,6 +65,41 @@ fn masks_are_scaled_clipped_and_counted() {
 }
 
 #[test]
+fn bipolar_masks_are_refused_and_noise_is_not() {
+    let refused = |stack: Array3<f32>, scale| match masks(stack, scale) {
+        Err(error @ FormatError::BipolarMasks { .. }) => error.to_string(),
+        other => panic!("{other:?}"),
+    };
+    let sign = |k: usize| if (k * 7919 % 101) % 2 == 0 { 1.0 } else { -1.0 };
+    let at = |(k, i, j): (usize, usize, usize)| k * 1024 + i * 32 + j;
+    let hadamard = Array3::from_shape_fn((2, 32, 32), |place| sign(at(place)));
+    assert_names(
+        &refused(hadamard.clone(), 1.0),
+        &["negative", "(1+C)/2", "(1-C)/2", "two exposures"],
+    );
+    // The scale that would fit is not known yet.
+    refused(&hadamard * 127.0, 1.0);
+    // Three levels, and a continuous pattern.
+    refused(
+        Array3::from_shape_fn((2, 32, 32), |place| (at(place) * 7919 % 101 % 3) as f32 - 1.0),
+        1.0,
+    );
+    refused(Array3::from_shape_fn((2, 32, 32), |place| (at(place) as f32 * 0.7).sin()), 1.0);
+    // A subtracted dark leaves noise around 0 in closed pixels, and in dark masks hardly anything else.
+    let noise = |place| {
+        let sum: usize = (1..13).map(|seed| at(place) * 7919 % 104_729 * seed % 1009).sum();
+        (sum as f32 / 1009.0 - 6.0) * 0.05
+    };
+    for open in [0.5, 0.02, 0.0] {
+        let stack = Array3::from_shape_fn((2, 32, 32), |place| {
+            let lit = (at(place) * 31 % 1000) as f32 / 1000.0 < open;
+            (noise(place) + f32::from(u8::from(lit))).min(1.0)
+        });
+        masks(stack, 1.0).unwrap();
+    }
+}
+
+#[test]
 fn only_rounding_above_one_is_tolerated() {
     let (_, scaled) = masks(array![[[1.0 + 5e-7, 0.5]]], 1.0).unwrap();
     assert_eq!(scaled, array![[[1.0, 0.5]]]);

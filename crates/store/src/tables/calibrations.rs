@@ -5,12 +5,12 @@ use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
 use crate::Store;
-use crate::columns::{Columns, FromRow, from_row, sql, sql_as};
+use crate::columns::{Columns, FromRow, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Filter, Page, refuse_if_used};
 use crate::tables::keys::Made;
 use crate::tables::requests::{self, Asked};
-use engine::job::{CalibrationId, Lab, Label, Mosaic, Sha256, Timestamp, TokenId};
+use engine::job::{CalibrationId, Lab, Label, Mosaic, Reading, Sha256, Timestamp, TokenId};
 
 /// Facts of a calibration whose masks have passed their check.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -33,6 +33,8 @@ pub struct NewCalibration {
     pub clipped_negatives: u64,
     /// The colours of the sensor's pixels; none for a grey one.
     pub mosaic: Option<Mosaic>,
+    /// The part of the masks' file that was read; `None` for captures.
+    pub reading: Option<Reading>,
 }
 
 from_row!(NewCalibration, row => {
@@ -49,6 +51,7 @@ from_row!(NewCalibration, row => {
     dead_pixels,
     clipped_negatives,
     mosaic,
+    reading = row.read_json("reading")?,
 });
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -188,8 +191,8 @@ async fn insert(
     let facts = &calibration.facts;
     sql!(
         "INSERT INTO calibrations (lab, token, id, name, masks, prepared, format, sample, axes, frames, height,
-             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at, mosaic)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at, mosaic, reading)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -208,7 +211,8 @@ async fn insert(
             facts.dead_pixels,
             facts.clipped_negatives,
             calibration.created_at,
-            facts.mosaic.map(|mosaic| mosaic.to_string())
+            facts.mosaic.map(|mosaic| mosaic.to_string()),
+            facts.reading.map(Json)
         ]
     )
     .execute(connection)

@@ -11,7 +11,8 @@ use crate::rows::{Filter, Page, refuse_if_used};
 use crate::tables::keys::Made;
 use crate::tables::requests::{self, Asked};
 use engine::job::{
-    CalibrationId, Finding, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp, TokenId,
+    CalibrationId, Finding, Lab, Label, MeasurementId, Reading, Sequence, Sha256, Timestamp,
+    TokenId,
 };
 
 /// Facts of a measurement that has passed its check.
@@ -39,6 +40,8 @@ pub struct NewMeasurement {
     pub dark: Vec<Sha256>,
     /// Findings of the check against the calibration.
     pub warnings: Vec<Finding>,
+    /// The part of the file that was read.
+    pub reading: Reading,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -166,8 +169,8 @@ async fn insert(
     sql!(
         "INSERT INTO measurements (lab, token, id, name, calibration, data, prepared, format, sample, axes,
              snapshots, height, width, full_scale, camera_fps, exposure_s, dark, warnings,
-             created_at, sequence)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             created_at, sequence, reading)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -188,7 +191,8 @@ async fn insert(
             Json(&facts.dark),
             Json(&facts.warnings),
             measurement.created_at,
-            facts.sequence
+            facts.sequence,
+            Json(facts.reading)
         ]
     )
     .execute(connection)
@@ -217,6 +221,7 @@ fn measurement(row: &SqliteRow) -> Result<Measurement> {
             sequence: row.read("sequence")?,
             dark: row.read_json("dark")?.unwrap_or_default(),
             warnings: row.read_json("warnings")?.unwrap_or_default(),
+            reading: row.read::<Json<Reading>>("reading")?.0,
         },
     })
 }

@@ -85,6 +85,7 @@ impl Lab {
             dead_pixels: 0,
             clipped_negatives: 0,
             mosaic: None,
+            reading: None,
         };
         let done = CalibrationDone { masks: Some((facts, masks)), ..report() };
         let completion = Completion {
