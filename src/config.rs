@@ -1,4 +1,4 @@
-//! All settings of the service. The comments here are the help on the command line.
+//! All settings of the service. The comments are the help of the command line.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -28,7 +28,7 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     pub data: PathBuf,
 
-    /// Address to listen at; port 0 takes a free port.
+    /// Address to listen on; port 0 selects a free port.
     #[arg(
         long,
         env = "SCI_RECON_LISTEN",
@@ -37,18 +37,18 @@ pub struct ServeArguments {
     )]
     pub listen: SocketAddr,
 
-    /// Listen at an address that other machines reach although there are no tokens: everyone who reaches it
-    /// may do everything.
+    /// Listen on an address that other machines can reach although there are no tokens: everyone who reaches it may do
+    /// everything.
     #[arg(long, env = "SCI_RECON_ALLOW_REMOTE")]
     pub allow_remote: bool,
 
-    /// Host names of the service, separated by commas, beside its addresses, `localhost` and the name of the
+    /// Host names of the service, separated by commas, in addition to its addresses, `localhost` and the name of the
     /// machine. While there are no tokens, requests of browsers with another name are refused.
     #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
     pub hosts: Vec<String>,
 
-    /// Worker processes to run besides the light worker, which checks uploads and does other short tasks. 0 runs none,
-    /// for workers that are started by hand; with --nats it runs one that leaves the tiles to other machines [default:
+    /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
+    /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
     /// one per core].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
@@ -132,6 +132,16 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
     pub max_jobs: u64,
 
+    /// Jobs of one lab that may wait and run, if there are several labs; `lab set --jobs` sets a limit for one lab
+    /// [default: the value of --max-jobs].
+    #[arg(long, env = "SCI_RECON_LAB_JOBS", value_name = "N")]
+    pub lab_jobs: Option<u64>,
+
+    /// Bytes that one lab may keep, if there are several labs; `lab set --bytes` sets a limit for one lab
+    /// [default: half of the disk].
+    #[arg(long, env = "SCI_RECON_LAB_BYTES", value_name = "BYTES", value_parser = bytes)]
+    pub lab_bytes: Option<u64>,
+
     /// Hours for which unused and incomplete uploads are kept.
     #[arg(long, env = "SCI_RECON_UPLOAD_HOURS", value_name = "HOURS", default_value_t = 72)]
     pub upload_hours: u64,
@@ -206,8 +216,7 @@ pub struct ClusterArguments {
           value_parser = clap::value_parser!(u64).range(2..=3600))]
     pub ack_wait: u64,
 
-    /// Share of the tiles that a second worker on another machine computes, too, and whose results are compared; 0
-    /// for none, 1 for all.
+    /// Share of the tiles that a second worker on another machine computes for comparison; 0 for none, 1 for all.
     #[arg(long, env = "SCI_RECON_VERIFY_FRACTION", value_name = "SHARE", default_value_t = 0.002,
           value_parser = fraction)]
     pub verify_fraction: f64,
@@ -221,7 +230,7 @@ pub struct RemoteArguments {
     #[command(flatten)]
     pub nats: NatsArguments,
 
-    /// Folder that caches inputs for later tiles; it may be removed afterwards [default: in the folder for
+    /// Folder that caches inputs for later tiles; it may be deleted when the worker has ended [default: in the folder for
     /// temporary files].
     #[arg(long, env = "SCI_RECON_CACHE", value_name = "DIR")]
     pub cache: Option<PathBuf>,
@@ -256,13 +265,13 @@ impl RemoteArguments {
     }
 }
 
-/// Run one more worker, here or on another machine.
+/// Run an additional worker, here or on another machine.
 ///
-/// It takes tasks of a data folder on this machine or, with --nats or --nats-creds, tiles of a server
-/// elsewhere, until it is stopped.
+/// It performs tasks of a data folder on this machine or, with --nats or --nats-creds, tiles of a server on another
+/// machine, until it is stopped.
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArguments {
-    /// Folder with the database, uploads and results; without effect for a server elsewhere.
+    /// Folder with the database, uploads and results; ignored for a server on another machine.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     #[cfg_attr(feature = "nats", arg(required_unless_present_any = ["nats", "nats_creds"]))]
     #[cfg_attr(not(feature = "nats"), arg(required = true))]
@@ -273,7 +282,7 @@ pub struct WorkerArguments {
     #[command(flatten)]
     pub remote: RemoteArguments,
 
-    /// Which tasks it takes.
+    /// Kinds of tasks that the worker performs.
     #[arg(long, value_enum, default_value_t, hide = true)]
     pub takes: Takes,
 
@@ -281,7 +290,7 @@ pub struct WorkerArguments {
     #[arg(long, env = "SCI_RECON_WORKER_LIMIT_BYTES", value_name = "BYTES")]
     pub memory_bytes: Option<u64>,
 
-    /// Where and how the worker computes.
+    /// Device and limits of the computation.
     #[command(flatten)]
     pub engine: EngineArguments,
 
@@ -293,12 +302,12 @@ pub struct WorkerArguments {
     #[arg(long, value_name = "ID", hide = true)]
     pub id: Option<WorkerId>,
 
-    /// End with standard input, which the server that started it holds open.
+    /// End when standard input closes, which the server holds open.
     #[arg(long, hide = true)]
     pub supervised: bool,
 }
 
-/// Which tasks a worker of this machine takes.
+/// Kinds of tasks that a worker of this machine performs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, IntoStaticStr)]
 #[strum(serialize_all = "kebab-case", const_into_str)]
 pub enum Takes {
@@ -320,10 +329,10 @@ impl From<Takes> for Claimant<'static> {
     }
 }
 
-/// Where and how workers compute.
+/// Device and limits of the computation.
 #[derive(Debug, Clone, Args)]
 pub struct EngineArguments {
-    /// Path of libonnxruntime [default: beside the program, or in ../lib/sci-recon, ../lib or ../../runtime].
+    /// Path of libonnxruntime [default: next to the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
@@ -331,8 +340,8 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
 
-    /// Nice value of workers (0 to 19), so that the API answers at full load. A process that is already nicer keeps
-    /// its value.
+    /// Nice value of workers (0 to 19), so that the API responds under full load. A process with a higher nice value keeps
+    /// it.
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
           value_parser = clap::value_parser!(i32).range(0..=19))]
     pub nice: i32,
@@ -342,8 +351,8 @@ pub struct EngineArguments {
     #[arg(long, env = "SCI_RECON_UNCONFINED")]
     pub unconfined: bool,
 
-    /// Seconds without progress, beyond four times the planned time of a task, after which its worker is
-    /// ended and another worker tries the task.
+    /// Seconds without progress, beyond four times the planned time of a task, after which its worker is terminated and
+    /// another worker tries the task.
     #[arg(long, env = "SCI_RECON_STALL_SECONDS", value_name = "SECONDS", default_value_t = 300)]
     pub stall_seconds: u64,
 }
@@ -351,21 +360,21 @@ pub struct EngineArguments {
 /// A time in seconds, above 0 and up to a day.
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse().ok().filter(|seconds| *seconds > 0.0 && *seconds <= 86_400.0);
-    seconds.ok_or_else(|| format!("{text:?} is no number of seconds above 0 and up to 86400"))
+    seconds.ok_or_else(|| format!("{text:?} is not a number of seconds above 0 and up to 86400"))
 }
 
 /// A share from 0 to 1.
 #[cfg(feature = "nats")]
 fn fraction(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
-    share.ok_or_else(|| format!("{text:?} is no share from 0 to 1"))
+    share.ok_or_else(|| format!("{text:?} is not a share from 0 to 1"))
 }
 
 /// Reads a number of bytes: `1000000`, `10GB` (powers of 1000) or `8GiB` (of 1024).
 pub fn bytes(text: &str) -> Result<u64, String> {
     let size: Result<ByteSize, String> = text.parse();
     size.map(|size| size.as_u64())
-        .map_err(|_| format!("{text:?} is no size; it should be like 1000000, 10GB or 8GiB"))
+        .map_err(|_| format!("{text:?} is not a size such as 1000000, 10GB or 8GiB"))
 }
 
 /// Format of log lines.
@@ -374,7 +383,7 @@ pub enum LogFormat {
     /// For people.
     #[default]
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
@@ -382,9 +391,9 @@ pub enum LogFormat {
 pub enum ConfigError {
     /// The service would be open to everyone.
     #[error(
-        "{0} can be reached from other machines, and everyone could do everything: make a token \
-         (sci-recon token create), listen at 127.0.0.1, or say --allow-remote if the network is \
-         trusted"
+        "{0} can be reached from other machines, and everyone could do everything: create a token \
+        (sci-recon token create), listen on 127.0.0.1, or set --allow-remote if the network is \
+        trusted"
     )]
     Remote(SocketAddr),
 }
@@ -401,19 +410,19 @@ impl ServeArguments {
     #[must_use]
     pub fn worker_count(&self) -> usize {
         let cores = || std::thread::available_parallelism().map_or(1, usize::from);
-        // With none there would be nobody for what does not leave this machine.
-        let least = usize::from(self.without_tiles());
-        self.workers.unwrap_or_else(cores).max(least)
+        // Tasks that do not leave this machine need a worker.
+        let minimum = usize::from(self.without_tiles());
+        self.workers.unwrap_or_else(cores).max(minimum)
     }
 
     /// True if the workers of this machine leave the tiles to others.
     #[must_use]
     pub fn without_tiles(&self) -> bool {
         #[cfg(feature = "nats")]
-        let elsewhere = self.cluster.nats.is_wanted();
+        let is_cluster = self.cluster.nats.is_wanted();
         #[cfg(not(feature = "nats"))]
-        let elsewhere = false;
-        elsewhere && self.workers == Some(0)
+        let is_cluster = false;
+        is_cluster && self.workers == Some(0)
     }
 
     #[must_use]
@@ -458,8 +467,8 @@ impl EngineArguments {
 }
 
 impl WorkerArguments {
-    /// Data folder that the worker opens. `None` for a worker of a server elsewhere, which ignores `data`: containers
-    /// and configuration files set it for all commands.
+    /// Data folder that the worker opens. `None` for a worker of a server on another machine: it ignores `data`, which
+    /// containers and configuration files set for all commands.
     #[must_use]
     pub fn data_folder(&self) -> Option<&Path> {
         #[cfg(feature = "nats")]
@@ -519,7 +528,7 @@ mod tests {
     }
 
     #[test]
-    fn only_this_machine_is_served_unless_told_so() {
+    fn a_public_address_needs_permission_or_tokens() {
         let serve = |listen: &[&str]| {
             let line = [&["serve", "--data", "d"], listen].concat();
             Serve::try_parse_from(line).unwrap().arguments.check(true)
@@ -555,7 +564,7 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_gets_the_arguments_that_were_meant_for_it() {
+    fn a_worker_process_receives_all_arguments() {
         let line = ["--data", "some dir", "--device", "cuda:0", "--nice", "5"];
         let more = [
             "--stall-seconds",
@@ -571,8 +580,8 @@ mod tests {
             "--log-format",
             "json",
         ];
-        let first = Worker::try_parse_from(line.iter().chain(&more)).unwrap().arguments;
-        let again = Worker::try_parse_from(&first.command_line()[1..]).unwrap().arguments;
-        assert_eq!(format!("{first:?}"), format!("{again:?}"));
+        let arguments = Worker::try_parse_from(line.iter().chain(&more)).unwrap().arguments;
+        let received = Worker::try_parse_from(&arguments.command_line()[1..]).unwrap().arguments;
+        assert_eq!(format!("{arguments:?}"), format!("{received:?}"));
     }
 }

@@ -1,4 +1,4 @@
-//! The service: how lab machines reach the reconstruction over HTTP, and the commands of the program.
+//! The service, which lab machines use over HTTP, and the commands of the program.
 
 pub mod cli;
 pub mod config;

@@ -208,10 +208,10 @@ fn read_crate(folder: &str) -> BTreeMap<Module, File> {
         if listing {
             module.pop();
         }
-        let place = path.strip_prefix(root).unwrap().to_string_lossy().into_owned();
+        let file_name = path.strip_prefix(root).unwrap().to_string_lossy().into_owned();
         let text = fs::read_to_string(&path).unwrap();
         let is_folder = listing || path.with_extension("").is_dir();
-        files.insert(module.clone(), read(&text, module, &place, is_folder));
+        files.insert(module.clone(), read(&text, module, &file_name, is_folder));
     }
     files
 }
@@ -244,14 +244,14 @@ fn dependencies(files: &BTreeMap<Module, File>) -> BTreeMap<Module, BTreeSet<Mod
     files.iter().map(of).collect()
 }
 
-/// The files that can be reached from one.
+/// The files on which a file depends directly or indirectly.
 fn ahead(edges: &BTreeMap<Module, BTreeSet<Module>>, from: &Module) -> BTreeSet<Module> {
-    let mut seen = BTreeSet::new();
+    let mut reached = BTreeSet::new();
     let mut open = vec![from];
     while let Some(at) = open.pop() {
-        open.extend(edges[at].iter().filter(|next| seen.insert((*next).clone())));
+        open.extend(edges[at].iter().filter(|next| reached.insert((*next).clone())));
     }
-    seen
+    reached
 }
 
 /// Sets of files in which each file depends on all others.
@@ -276,7 +276,7 @@ fn between_siblings(
             let child = |module: &Module| module[..module.len().min(shared + 1)].to_vec();
             let (from, to) = (child(from), child(to));
             siblings.entry(to.clone()).or_default();
-            // A folder's own file depends on its children, and is no child of the folder.
+            // The file of a folder depends on its children, but is not one of them.
             if from.len() == to.len() {
                 siblings.entry(from).or_default().insert(to);
             }
@@ -354,7 +354,7 @@ fn the_check_detects_circles() {
     let files = BTreeMap::from([
         (Module::new(), read("mod a;", Module::new(), "lib", true)),
         file("a", "mod b; mod c; mod d; pub use b::Thing;", true),
-        // An import through the folder's exports, and a path inside an expression.
+        // The file imports through the folder's exports, and names a path in an expression.
         file("a::b", "fn f() { super::c::g(); } pub struct Thing;", false),
         file("a::c", "use crate::a::{Thing, d::{self, h}};", false),
         file("a::d", "use std::fs; #[cfg(test)] mod tests { use super::super::c; }", false),

@@ -25,10 +25,10 @@ pub(super) struct ScheduleArguments {
     #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
           value_parser = named_all())]
     pub(super) algorithm: Algorithm,
-    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
+    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's default.
     #[arg(long, value_name = "FILE")]
     schedule: Option<PathBuf>,
-    /// Do exactly N iterations, without the test for convergence; the last stage is shortened or extended.
+    /// Run exactly N iterations without a test for convergence; the last stage is shortened or extended.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     iterations: Option<u32>,
 }
@@ -36,7 +36,7 @@ pub(super) struct ScheduleArguments {
 /// Runtime and device of networks.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
-    /// Path of libonnxruntime [default: beside the program, or in ../lib/sci-recon, ../lib or ../../runtime].
+    /// Path of libonnxruntime [default: next to the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
     /// Device that runs networks: cpu, or cuda:0 for the first GPU.
@@ -45,7 +45,7 @@ pub struct NetworkArguments {
 }
 
 impl ScheduleArguments {
-    /// The schedule, checked; without stages for an algorithm that has none.
+    /// Reads and checks the schedule. It has no stages for `learned`.
     pub(super) fn resolve(&self) -> Result<Schedule> {
         if self.algorithm == Algorithm::Learned {
             if self.schedule.is_some() || self.iterations.is_some() {
@@ -81,11 +81,11 @@ impl ScheduleArguments {
     }
 }
 
-/// A selection of snapshots: `all`, one index, or `FIRST-LAST` with both ends in.
+/// A selection of snapshots: `all`, one index, or `FIRST-LAST` including both ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Snapshots {
     pub(super) first: usize,
-    /// None for the last snapshot of the file.
+    /// `None` selects the last snapshot of the file.
     pub(super) last: Option<usize>,
 }
 
@@ -93,7 +93,7 @@ impl FromStr for Snapshots {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("{text:?}; name one index, FIRST-LAST with both ends in, or all");
+        let wrong = || format!("{text:?}; give one index, FIRST-LAST including both ends, or all");
         let index = |text: &str| text.parse::<usize>().map_err(|_| wrong());
         let (first, last) = match text.split_once('-') {
             None if text == "all" => return Ok(Self { first: 0, last: None }),
@@ -116,9 +116,9 @@ impl Snapshots {
 }
 
 impl NetworkArguments {
-    /// Confines this process, which runs a network of a user: limited memory, no connections, and no files but
-    /// the system's, libonnxruntime and `readable`. Must be called before the process starts a thread. GPUs and
-    /// `unconfined` skip all but the memory limit.
+    /// Confines this process, which runs a network of a user. It limits the memory, forbids connections, and allows
+    /// only the files of the system, libonnxruntime and `readable`. Must be called before the process starts a
+    /// thread. With a GPU or `unconfined`, only the memory limit applies.
     /// Errors: the memory can't be limited. Other failures are printed to standard error.
     pub(super) fn confine(
         &self,
@@ -134,8 +134,8 @@ impl NetworkArguments {
         }
         let library = folders_of(self.onnxruntime.as_deref());
         let readable: Vec<_> = library.iter().map(PathBuf::as_path).chain(readable).collect();
-        if let Err(why) = confine_network(&readable) {
-            eprintln!("a network is not confined: {why}");
+        if let Err(reason) = confine_network(&readable) {
+            eprintln!("a network is not confined: {reason}");
         }
         Ok(())
     }
@@ -147,28 +147,27 @@ impl NetworkArguments {
     }
 }
 
-/// Names of algorithms that need no network of the user.
+/// Parses names of algorithms that need no network of the user.
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
-    let own = &Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1];
-    named(own)
+    named(&Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1])
 }
 
-/// Colours of a sensor's pixels.
+/// Parses a colour pattern of a sensor.
 pub(super) fn mosaic() -> impl TypedValueParser<Value = Mosaic> {
     PossibleValuesParser::new(Mosaic::VARIANTS).try_map(|name: String| name.parse::<Mosaic>())
 }
 
-/// Kinds of sequences.
+/// Parses a kind of sequence.
 pub(super) fn sequence() -> impl TypedValueParser<Value = Sequence> {
     PossibleValuesParser::new(Sequence::VARIANTS).try_map(|name: String| name.parse::<Sequence>())
 }
 
-/// Orders of axes.
+/// Parses an order of axes.
 pub(super) fn axes() -> impl TypedValueParser<Value = Axes> {
     PossibleValuesParser::new(Axes::VARIANTS).try_map(|name: String| name.parse::<Axes>())
 }
 
-/// Names of all algorithms.
+/// Parses names of all algorithms.
 pub(super) fn named_all() -> impl TypedValueParser<Value = Algorithm> {
     named(Algorithm::VARIANTS)
 }
@@ -210,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_schedules_are_named_with_their_file_and_place() {
+    fn an_error_in_a_schedule_names_the_file_and_the_field() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("schedule.json");
         let message = |algorithm: &str, text: &str| {

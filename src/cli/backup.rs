@@ -1,4 +1,4 @@
-//! `sci-recon backup`: a consistent copy of a data folder.
+//! `sci-recon backup`: copies a data folder consistently.
 
 use std::path::PathBuf;
 
@@ -12,14 +12,14 @@ use store::{Backup, Purpose, Store};
 
 /// Copy the data folder while the service runs.
 ///
-/// Compares every file with its record. The copy is called NAME.unfinished until it is complete, and no service
-/// accepts that. To restore it, serve the copy (or a copy of it). Ends with 1 if a file is damaged or missing.
+/// Compares every file with its record. The copy is called NAME.unfinished until it is complete; no service accepts
+/// an unfinished copy. To restore it, serve the copy (or a copy of it). Ends with 1 if a file is damaged or missing.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     data: PathBuf,
-    /// Folder to copy to; it must not be there yet.
+    /// Folder to copy to; it must not exist.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
@@ -27,7 +27,7 @@ pub struct Arguments {
 /// Makes the copy and prints its figures as one JSON line.
 pub fn run(arguments: &Arguments) -> Result<()> {
     if arguments.out.exists() {
-        let text = format!("{} is there already; name a new folder", arguments.out.display());
+        let text = format!("{} already exists; choose a new folder", arguments.out.display());
         return Err(CliError::Input(text));
     }
     let backup = wait(async {
@@ -44,5 +44,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         return Ok(());
     }
     let bad = [damaged, missing].concat().join(", ");
-    Err(CliError::Failure(format!("the copy has all there is, but damaged or missing are: {bad}")))
+    Err(CliError::Failure(format!(
+        "the copy is complete except for files that are damaged or missing: {bad}"
+    )))
 }

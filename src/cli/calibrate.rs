@@ -1,4 +1,4 @@
-//! `sci-recon calibrate`: masks and a report from raw captures, without a server.
+//! `sci-recon calibrate`: makes masks and a report from raw captures, without a server.
 
 use std::fs::{self, File};
 use std::io::BufWriter;
@@ -30,7 +30,7 @@ pub struct Arguments {
     json: bool,
 }
 
-/// The index of the captures. What belongs to a measurement is not looked at.
+/// The index of the captures. Fields of a measurement are ignored.
 #[derive(Debug, Deserialize)]
 struct Index {
     masks: Vec<Vec<PathBuf>>,
@@ -51,7 +51,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         progress::show(&bar, share);
         true
     };
-    // Beside the result, where there is room for it.
+    // The output folder has the space for it; the folder for temporary files may be small.
     let scratch = tempfile::Builder::new().prefix(".making-").tempfile_in(out);
     let scratch = scratch.map_err(|error| CliError::file("write", out, &error))?;
     let masks = |info: &StackInfo| {
@@ -59,31 +59,31 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let file = file.map_err(FormatError::io("write masks.npy"))?;
         npy::writer(BufWriter::new(file), (info.frames, info.height, info.width), Channels::Grey)
     };
-    let made = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share);
-    let (made, _) = made.map_err(|error| match error.is_retryable() {
-        // Of what is written, too.
+    let calibrated = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share);
+    let (calibrated, _) = calibrated.map_err(|error| match error.is_retryable() {
+        // Includes failures to write.
         true => CliError::Failure(error.to_string()),
         false => error.into(),
     })?;
     bar.finish_and_clear();
-    write_report(arguments, &made.report)
+    write_report(arguments, &calibrated.report)
 }
 
-fn write_report(arguments: &Arguments, made: &Report) -> Result<()> {
+fn write_report(arguments: &Arguments, report: &Report) -> Result<()> {
     let out = &arguments.out;
     let failed = |error| CliError::file("write", out, &error);
-    let text = serde_json::to_string_pretty(&made.report)
+    let text = serde_json::to_string_pretty(&report.report)
         .map_err(|error| CliError::Failure(format!("the report: {error}")))?;
     let name = arguments.captures.display().to_string();
-    fs::write(out.join("report.html"), report_page(&name, &made.report)).map_err(failed)?;
-    for (name, png) in &made.maps {
+    fs::write(out.join("report.html"), report_page(&name, &report.report)).map_err(failed)?;
+    for (name, png) in &report.maps {
         fs::write(out.join("maps").join(format!("{name}.png")), png).map_err(failed)?;
     }
     if arguments.json {
         print_line(&text)?;
     } else {
-        print_line(format!("grade: {}", made.report.grade.into_str()))?;
-        verdict::lines(&made.report.findings).iter().try_for_each(print_line)?;
+        print_line(format!("grade: {}", report.report.grade.into_str()))?;
+        verdict::lines(&report.report.findings).iter().try_for_each(print_line)?;
         print_line(format!("masks.npy and report.html are in {}", out.display()))?;
     }
     fs::write(out.join("report.json"), text + "\n").map_err(failed)

@@ -1,7 +1,7 @@
-//! `sci-recon check-model`: looks whether a network can be used, in a process of its own.
+//! `sci-recon check-model`: checks in a separate process whether a network can be used.
 //!
-//! Loading a stranger's network runs native code on what it says: it may crash, hang, or take all
-//! memory. The service starts this command so that none of that is the service's.
+//! Loading a stranger's network runs native code on its content: it may crash, hang, or take all memory. The service
+//! starts this command so that such a failure does not affect the service.
 
 use std::path::PathBuf;
 
@@ -19,16 +19,16 @@ use reconstruction::ReconError;
 use reconstruction::learned::{PictureSize, SnapshotNetwork, TensorInfo};
 use reconstruction::tile::TilePlan;
 
-/// How much the check stands back for others.
+/// Nice value of the check.
 const NICE: i32 = 10;
 
-/// Characters that are kept of a tensor's name.
-const NAME: usize = 100;
+/// Longest name of a tensor that is reported, in characters.
+const MAX_NAME: usize = 100;
 
-/// Check a network of your own for `learned`.
+/// Check a custom network for `learned`.
 ///
-/// Checks whether it fits masks of a size, and runs it once on a dark scene. Prints one JSON object: its
-/// properties, or why it is refused.
+/// Checks whether it fits masks of a given size, and runs it once on a dark scene. Prints one JSON object with its
+/// properties, or the reason why it is refused.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The ONNX file.
@@ -43,20 +43,20 @@ pub struct Arguments {
     /// Columns of the masks.
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(1..))]
     width: u32,
-    /// The most memory that the check may take [default: no limit].
+    /// Memory limit of the check [default: no limit].
     #[arg(long, value_name = "BYTES")]
     memory_bytes: Option<u64>,
-    /// Leaves the check all files and connections that its user may have.
+    /// Do not restrict the files and connections of the check.
     #[arg(long, hide = true)]
     unconfined: bool,
-    /// Ends when its standard input does: the worker that started it is gone then.
+    /// End when standard input ends, because the worker that started the check has then ended.
     #[arg(long, hide = true)]
     supervised: bool,
     #[command(flatten)]
     engine: NetworkArguments,
 }
 
-/// Runs the command. A network that can't be used is no failure of the command.
+/// Runs the command. An unusable network is a result of the command, not a failure.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let refused = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     rustix::process::setpriority_process(None, NICE).map_err(|error| refused(&error))?;
@@ -69,7 +69,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     engine.confine(*memory_bytes, *unconfined, Some(file))?;
     let network = arguments.engine.network()?;
-    // Without a library nothing can be said of the network.
+    // Fails before the network is loaded if the library is missing.
     network.version()?;
     let file =
         ModelFile::open(&arguments.file).map_err(|error| CliError::Input(error.to_string()))?;
@@ -94,7 +94,7 @@ fn facts(
     let mut network = network.end_to_end(&file.content()?)?;
     let interface = network.interface();
     let size = interface.check(frames, height, width)?;
-    let trial = match size {
+    let trial_size = match size {
         PictureSize::Fixed => (height, width),
         PictureSize::Free => first_tile(height, width)?,
     };
@@ -102,23 +102,23 @@ fn facts(
         inputs: interface.inputs.into_iter().map(tensor).collect(),
         outputs: interface.outputs.into_iter().map(tensor).collect(),
         fixed_size: size == PictureSize::Fixed,
-        trial: run_once(&mut network, frames, trial)?,
+        trial: run_once(&mut network, frames, trial_size)?,
     })
 }
 
 fn tensor(TensorInfo { name, sides, .. }: TensorInfo) -> ModelTensor {
-    // A name is any text of the file.
-    ModelTensor { name: name.chars().take(NAME).collect(), shape: sides }
+    // The file may contain names of any length.
+    ModelTensor { name: name.chars().take(MAX_NAME).collect(), shape: sides }
 }
 
-/// The size of the tiles of a job that names none.
+/// The default size of a job's tiles.
 fn first_tile(height: usize, width: usize) -> Result<(usize, usize), ReconError> {
     let TileSpec { size, overlap } = Algorithm::Learned.default_tile();
     let tile = TilePlan::new(height, width, size, overlap)?.tile(0);
     Ok(tile.map_or((height, width), |tile| (tile.height, tile.width)))
 }
 
-/// A dark scene through half-open masks: masks of 0 would be divided by in many a network.
+/// Runs a network on a dark scene with half-open masks. Many networks would divide by masks of 0.
 fn run_once(
     network: &mut dyn SnapshotNetwork,
     frames: usize,

@@ -1,4 +1,4 @@
-//! `sci-recon cluster`: the message server for workers on other machines, and who may use it.
+//! `sci-recon cluster`: configures the message server for workers on other machines, and manages credentials.
 
 use std::path::PathBuf;
 
@@ -25,14 +25,14 @@ enum Command {
     Check(CheckArguments),
 }
 
-/// Make keys, certificates, and a configuration of nats-server for each node.
+/// Create keys, certificates, and a configuration of nats-server for each node.
 #[derive(Debug, Args)]
 struct Init {
     #[command(flatten)]
     folder: Folder,
 
-    /// A node of the NATS server as workers reach it; again for each node, 3 of them for a server that
-    /// outlives one.
+    /// A node of the NATS server, as workers reach it; may be repeated. With 3 nodes, the server survives the loss of
+    /// one.
     #[arg(long = "node", value_name = "HOST[:PORT]", default_value = "127.0.0.1:4222")]
     nodes: Vec<Node>,
 
@@ -40,15 +40,15 @@ struct Init {
     #[arg(long, value_name = "DIR")]
     store: Option<PathBuf>,
 
-    /// The most bytes in it.
+    /// Limit of the folder's size in bytes.
     #[arg(long, value_name = "N", default_value_t = 20 << 30)]
     store_bytes: u64,
 
-    /// Version of the nodes' nats-server, such as 2.12 [default: that on this machine, or else a current one].
+    /// Version of the nodes' nats-server, such as 2.12 [default: the version on this machine, or a current one].
     #[arg(long, value_name = "VERSION")]
     nats_version: Option<ServerVersion>,
 
-    /// Without encryption: for one machine, or a network of its own.
+    /// Do not encrypt connections: for a single machine or an isolated network.
     #[arg(long)]
     no_tls: bool,
 }
@@ -62,17 +62,17 @@ struct Worker {
 
 #[derive(Debug, Subcommand)]
 enum WorkerCommand {
-    /// Make a credential for the workers of a pool: one file, which is all that they need.
+    /// Create a credential for the workers of a pool: one file with everything they need.
     Create {
         #[command(flatten)]
         folder: Folder,
         /// The pool. Its workers see the tiles of every lab.
         #[arg(long)]
         pool: Pool,
-        /// A name for it [default: the pool's].
+        /// Name of the credential [default: the pool's].
         #[arg(long)]
         name: Option<String>,
-        /// Days until it ends.
+        /// Days until it expires.
         #[arg(long, default_value_t = 365, value_parser = clap::value_parser!(u32).range(1..=3650))]
         days: u32,
         /// The file to write [default: NAME.creds].
@@ -91,13 +91,13 @@ enum WorkerCommand {
         /// The pool.
         #[arg(long)]
         pool: Pool,
-        /// This one alone [default: all of the pool].
+        /// Revoke only the credential with this name [default: all of the pool].
         #[arg(long)]
         name: Option<String>,
     },
 }
 
-/// Check whether a server, or a worker with its credential, can work, and name what is missing.
+/// Check whether a server, or a worker with its credential, can work, and list missing requirements.
 #[derive(Debug, Args)]
 struct CheckArguments {
     #[command(flatten)]
@@ -106,7 +106,7 @@ struct CheckArguments {
 
 #[derive(Debug, Args)]
 struct Folder {
-    /// Folder with the keys of the cluster. Who has it can make credentials.
+    /// Folder with the keys of the cluster. Keep it secret: it allows to create credentials.
     #[arg(
         long = "keys",
         env = "SCI_RECON_CLUSTER_KEYS",
@@ -116,7 +116,6 @@ struct Folder {
     path: PathBuf,
 }
 
-/// Does what was asked.
 pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     match &arguments.command {
         Command::Init(init) => make(init),
@@ -136,8 +135,9 @@ fn make(init: &Init) -> Result<(), CliError> {
     }
     authority.write_own_credentials()?;
     let disk = (store.as_path(), *store_bytes);
-    let made = configuration::write(&authority, &folder.path, nodes, disk, tls, *nats_version)?;
-    for file in made.files {
+    let configured =
+        configuration::write(&authority, &folder.path, nodes, disk, tls, *nats_version)?;
+    for file in configured.files {
         print_line(format!("nats-server -c {}", file.display()))?;
     }
     let hub = folder.path.join(workers::nats::HUB_CREDENTIAL);
@@ -146,7 +146,7 @@ fn make(init: &Init) -> Result<(), CliError> {
         "sci-recon cluster worker create --keys {} --pool NAME",
         folder.path.display()
     ))?;
-    for warning in made.warnings {
+    for warning in configured.warnings {
         eprintln!("warning: {warning}");
     }
     Ok(())
@@ -161,20 +161,20 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
             print_line(out.display())?;
         }
         WorkerCommand::List { folder } => {
-            print_line(format!("{:24} {:16} {:8} {:20} key", "name", "pool", "state", "ends"))?;
+            print_line(format!("{:24} {:16} {:8} {:20} key", "name", "pool", "state", "expires"))?;
             let now = Timestamp::now().0 / 1000;
             for worker in Authority::open(&folder.path)?.workers() {
                 let state = match worker.revoked_at {
                     Some(_) => "revoked",
-                    None if worker.expires_at <= now => "ended",
-                    None => "good",
+                    None if worker.expires_at <= now => "expired",
+                    None => "valid",
                 };
-                let ends = Timestamp(worker.expires_at * 1000).to_string();
+                let expires = Timestamp(worker.expires_at * 1000).to_string();
                 print_line(format!(
                     "{:24} {:16} {state:8} {:20} {}",
                     worker.name,
                     worker.pool.as_str(),
-                    ends.get(..19).unwrap_or(&ends),
+                    expires.get(..19).unwrap_or(&expires),
                     worker.key
                 ))?;
             }
@@ -182,7 +182,7 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
         WorkerCommand::Revoke { folder, pool, name } => {
             let mut authority = Authority::open(&folder.path)?;
             let revoked = authority.revoke(pool, name.as_deref())?;
-            // Also when all were revoked before: the message server may not have been told.
+            // Repeats earlier revocations too, in case the message server has missed one.
             wait(authority.publish())?;
             for name in revoked {
                 print_line(format!("revoked {name}"))?;
@@ -199,7 +199,7 @@ fn examine(check: &CheckArguments) -> Result<(), CliError> {
     for Check { what, good, found } in checks {
         print_line(format!("{} {what}: {found}", if good { "ok     " } else { "missing" }))?;
     }
-    if bad == 0 { Ok(()) } else { Err(CliError::Failure(format!("{bad} things are missing"))) }
+    if bad == 0 { Ok(()) } else { Err(CliError::Failure(format!("{bad} checks have failed"))) }
 }
 
 impl From<ClusterError> for CliError {

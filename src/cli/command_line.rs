@@ -1,4 +1,4 @@
-//! The command line of the program: its commands, by group, and how each is run.
+//! The command line of the program: defines the commands in groups, and runs them.
 
 use std::ffi::OsString;
 use std::fmt::Write;
@@ -85,7 +85,7 @@ enum ConfigAction {
     },
 }
 
-/// Headings of the help, with their commands in order.
+/// Headings of the help, and the commands below each.
 const GROUPS: [(&str, &[&str]); 4] = [
     ("Lab machine", &["submit", "watch", "fetch", "ls", "cancel", "watch-folder"]),
     ("Server", &["serve", "worker", "health"]),
@@ -110,7 +110,7 @@ const GROUPS: [(&str, &[&str]); 4] = [
     ),
 ];
 
-/// The commands, described in groups by the help.
+/// The root command, with a help that lists the commands in groups.
 fn command() -> clap::Command {
     let root = Arguments::command();
     let width = root.get_subcommands().map(|command| command.get_name().len()).max();
@@ -130,7 +130,7 @@ fn command() -> clap::Command {
     root.help_template(template)
 }
 
-/// Runs a command line, the name of the program first.
+/// Runs a command line. Its first word is the name of the program.
 pub fn run(line: Vec<OsString>) -> ExitCode {
     let outcome = super::settings::expand(&command(), line).and_then(|expanded| {
         let parsed = command().try_get_matches_from(&expanded.line);
@@ -188,7 +188,7 @@ fn perform(arguments: Arguments) -> Result<()> {
 mod tests {
     use super::{GROUPS, command};
 
-    /// Longest line of the root's help, which is not wrapped.
+    /// Width of a terminal that the unwrapped help must fit.
     const COLUMNS: usize = 80;
 
     #[test]
@@ -221,7 +221,7 @@ mod tests {
                 let about = below.get_about().unwrap_or_else(|| panic!("{}", below.get_name()));
                 let about = about.to_string();
                 let verb = about.split(' ').next().unwrap();
-                // "Compress" and "process" would be imperatives that end in s.
+                // "Compress" and "process" are imperatives that end in s.
                 let imperative = !verb.ends_with('s') || verb.ends_with("ss");
                 assert!(imperative, "{}: {about}", below.get_name());
                 check(below);

@@ -1,9 +1,9 @@
 //! Confinement of the processes that run native code on a stranger's data: workers, and networks of users.
 //!
-//! Each takes only the planned memory (`RLIMIT_DATA`). A worker opens no connections and reads only the data folder
-//! and the system's libraries. A network's process is limited to an allow-list of system calls: it computes with
-//! threads, opens files for reading, and starts no processes, maps no shared memory and signals nobody else.
-//! Landlock keeps the files, where the kernel has it; the system calls are filtered by seccomp in any case.
+//! `RLIMIT_DATA` limits each process to the planned memory. A worker opens no connections and reads only the data
+//! folder and the system's libraries. A network's process is limited to an allow-list of system calls: it can use
+//! threads and open files for reading. It can't start processes, map shared memory or signal other processes.
+//! Landlock restricts the files if the kernel supports it. Seccomp filters the system calls in any case.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -21,9 +21,9 @@ use seccompiler::{
 use crate::config::EngineArguments;
 use engine::pipeline::networks::find_library;
 
-/// The newest version of Landlock that was tried; older kernels do what they can.
+/// Newest version of Landlock that was tested. Older kernels apply the rules that they support.
 const LANDLOCK: ABI = ABI::V6;
-/// Where libraries lie, and what they look at: processors, devices.
+/// Paths of libraries, and of information on processors and devices that libraries read.
 const SYSTEM: [&str; 11] = [
     "/usr",
     "/lib",
@@ -41,8 +41,8 @@ const SYSTEM: [&str; 11] = [
 /// Devices that a confined process may open.
 const DEVICES: [&str; 5] = ["/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom"];
 
-/// System calls that a worker is refused: connections, and ways into other processes or out of its own limits.
-const REFUSED_TO_WORKERS: [i64; 10] = [
+/// System calls that a worker may not make: they open connections, reach into other processes, or escape the limits.
+const DENIED_TO_WORKERS: [i64; 10] = [
     libc::SYS_socket,
     libc::SYS_ptrace,
     libc::SYS_process_vm_readv,
@@ -55,8 +55,8 @@ const REFUSED_TO_WORKERS: [i64; 10] = [
     libc::SYS_pidfd_getfd,
 ];
 
-/// System calls that a network may make with any arguments: input and output on what is open, private memory, threads,
-/// time, and questions about itself and the machine.
+/// System calls that a network may make with any arguments: input and output on open files, private memory, threads,
+/// time, and information about the process and the machine.
 #[rustfmt::skip]
 const ALLOWED_TO_NETWORKS: &[i64] = &[
     libc::SYS_read, libc::SYS_write, libc::SYS_readv, libc::SYS_writev, libc::SYS_pread64, libc::SYS_lseek,
@@ -69,67 +69,67 @@ const ALLOWED_TO_NETWORKS: &[i64] = &[
     libc::SYS_getuid, libc::SYS_geteuid, libc::SYS_getgid, libc::SYS_getegid, libc::SYS_getrusage, libc::SYS_uname,
     libc::SYS_sysinfo, libc::SYS_rt_sigaction, libc::SYS_rt_sigprocmask, libc::SYS_rt_sigreturn,
     libc::SYS_sigaltstack, libc::SYS_restart_syscall, libc::SYS_exit, libc::SYS_exit_group,
-    // Replaced by `clone` through [`without_clone3`].
+    // `without_clone3` makes the C library use `clone` instead.
     libc::SYS_clone3,
 ];
 
-/// Further ones of the first 64-bit Linux, which later architectures lack.
+/// Further allowed calls of x86-64, which newer architectures lack.
 #[cfg(target_arch = "x86_64")]
 #[rustfmt::skip]
-const ALLOWED_OF_OLD: &[i64] = &[
+const ALLOWED_LEGACY: &[i64] = &[
     libc::SYS_stat, libc::SYS_lstat, libc::SYS_access, libc::SYS_readlink, libc::SYS_poll, libc::SYS_arch_prctl,
     libc::SYS_time, libc::SYS_getdents, libc::SYS_getrlimit,
 ];
 #[cfg(not(target_arch = "x86_64"))]
-const ALLOWED_OF_OLD: &[i64] = &[];
+const ALLOWED_LEGACY: &[i64] = &[];
 
-/// Lets this process take so many bytes of memory.
+/// Limits the memory of this process.
 pub(super) fn limit_memory(bytes: u64) -> Result<(), String> {
     let limit = Rlimit { current: Some(bytes), maximum: Some(bytes) };
     setrlimit(Resource::Data, limit)
         .map_err(|error| format!("the memory can't be limited: {error}"))
 }
 
-/// Confines this process as a worker, which reads the given folders and those of the system, and writes only the
-/// writable ones. Must run before the process starts a thread.
+/// Confines this process as a worker, which may read the folders in `readable` and those of the system, and write
+/// to those in `writable`. Must run before the process starts a thread.
 ///
 /// # Errors
-/// Says which part of the confinement the kernel does not offer.
+/// If the kernel lacks a part of the confinement; the text names it.
 pub(super) fn confine_worker(readable: &[&Path], writable: &[&Path]) -> Result<(), String> {
-    let rules = REFUSED_TO_WORKERS.iter().map(|&call| (call, Vec::new())).collect();
+    let rules = DENIED_TO_WORKERS.iter().map(|&call| (call, Vec::new())).collect();
     let filter = filter(rules, SeccompAction::Allow, refusal(libc::EPERM)).map_err(text)?;
     confine(readable, writable, &[filter])
 }
 
-/// Confines this process as the network of a user, which reads the system's libraries and `readable`. Must run before
-/// the process starts a thread.
+/// Confines this process as the network of a user, which may read the system's libraries and `readable`. Must run
+/// before the process starts a thread.
 ///
 /// # Errors
-/// Says which part of the confinement the kernel does not offer.
+/// If the kernel lacks a part of the confinement; the text names it.
 pub(super) fn confine_network(readable: &[&Path]) -> Result<(), String> {
     let rules = network_rules().map_err(text)?;
     let allowed = filter(rules, refusal(libc::EPERM), SeccompAction::Allow).map_err(text)?;
-    // The allow-list comes last: it refuses to install another filter.
+    // The allow-list comes last, because it forbids to install another filter.
     confine(readable, &[], &[without_clone3().map_err(text)?, allowed])
 }
 
-/// Whether files are kept from networks of users; if not, why.
+/// Checks whether networks of users are kept from files. The error is the reason why they are not.
 pub(super) fn confinement(engine: &EngineArguments) -> Result<(), String> {
-    let why = if engine.unconfined {
+    let reason = if engine.unconfined {
         "--unconfined was given".to_owned()
     } else if engine.device != "cpu" {
-        "the driver of a GPU opens what it wants".to_owned()
+        "the driver of a GPU needs files that can't be listed".to_owned()
     } else {
-        let Err(why) = files_can_be_kept() else { return Ok(()) };
-        why
+        let Err(reason) = check_landlock() else { return Ok(()) };
+        reason
     };
-    Err(format!("networks of users can read every file that the service can: {why}"))
+    Err(format!("networks of users can read every file that the service can: {reason}"))
 }
 
-/// Whether this kernel can keep files from a process; if not, why. Tried on a thread, which ends.
-fn files_can_be_kept() -> Result<(), String> {
-    let tried = std::thread::spawn(|| restrict_files(&[], &[]).map_err(|error| error.to_string()));
-    enforced(tried.join().unwrap_or_else(|_| Err("Landlock can't be tried".into()))?)
+/// Checks on a short-lived thread whether this kernel can restrict the files of a process.
+fn check_landlock() -> Result<(), String> {
+    let thread = std::thread::spawn(|| restrict_files(&[], &[]).map_err(|error| error.to_string()));
+    enforced(thread.join().unwrap_or_else(|_| Err("Landlock can't be tested".into()))?)
 }
 
 fn confine(readable: &[&Path], writable: &[&Path], filters: &[BpfProgram]) -> Result<(), String> {
@@ -150,14 +150,14 @@ fn enforced(files: RulesetStatus) -> Result<(), String> {
 }
 
 fn restrict_files(readable: &[&Path], writable: &[&Path]) -> Result<RulesetStatus, RulesetError> {
-    // Also where the dynamic linker was told to look.
-    let linked = std::env::var_os("LD_LIBRARY_PATH").unwrap_or_default();
-    let linked: Vec<PathBuf> = std::env::split_paths(&linked).collect();
-    let system = SYSTEM.iter().map(PathBuf::from).chain(linked);
+    // The dynamic linker also searches these folders.
+    let library_path = std::env::var_os("LD_LIBRARY_PATH").unwrap_or_default();
+    let library_path: Vec<PathBuf> = std::env::split_paths(&library_path).collect();
+    let system = SYSTEM.iter().map(PathBuf::from).chain(library_path);
     let program = std::env::current_exe().ok().and_then(|path| Some(path.parent()?.to_owned()));
     let readable = readable.iter().map(|path| path.to_path_buf());
     let readable: Vec<PathBuf> = system.chain(program).chain(readable).collect();
-    // Of what is not there no rule is made.
+    // Paths that do not exist get no rule.
     let status = Ruleset::default()
         .handle_access(AccessFs::from_all(LANDLOCK))?
         .handle_access(AccessNet::from_all(LANDLOCK))?
@@ -170,7 +170,8 @@ fn restrict_files(readable: &[&Path], writable: &[&Path]) -> Result<RulesetStatu
     Ok(status.ruleset)
 }
 
-/// The folder of the libonnxruntime that is named, or near the program, and that which it leads to.
+/// The folder of libonnxruntime, and the folder that the library links to. The library is the one that is named, or one
+/// near the program.
 pub(super) fn folders_of(named: Option<&Path>) -> Vec<PathBuf> {
     let Ok(library) = find_library(named) else { return Vec::new() };
     let paths = [library.canonicalize().ok(), Some(library)];
@@ -181,7 +182,7 @@ type Rules = BTreeMap<i64, Vec<SeccompRule>>;
 
 /// The allow-list of a network's process.
 fn network_rules() -> Result<Rules, BackendError> {
-    let mut rules: Rules = [ALLOWED_TO_NETWORKS, ALLOWED_OF_OLD]
+    let mut rules: Rules = [ALLOWED_TO_NETWORKS, ALLOWED_LEGACY]
         .concat()
         .into_iter()
         .map(|call| (call, Vec::new()))
@@ -202,20 +203,20 @@ fn network_rules() -> Result<Rules, BackendError> {
         rules.entry(call).or_default().push(SeccompRule::new(conditions)?);
         Ok(())
     };
-    // Threads, and no processes.
+    // Allows threads but no processes.
     allow(libc::SYS_clone, vec![bits(0, libc::CLONE_THREAD, libc::CLONE_THREAD)?])?;
     // Shared mappings outlive a process and escape its limit of memory.
     let kind = libc::MAP_SHARED | libc::MAP_PRIVATE;
     allow(libc::SYS_mmap, vec![bits(3, kind, libc::MAP_PRIVATE)?])?;
-    // Files are opened for reading, also where no Landlock keeps them.
+    // Files open only for reading, even without Landlock.
     let writes = libc::O_ACCMODE | libc::O_CREAT | libc::O_TRUNC;
     allow(libc::SYS_openat, vec![bits(2, writes, libc::O_RDONLY)?])?;
     #[cfg(target_arch = "x86_64")]
     allow(libc::SYS_open, vec![bits(1, writes, libc::O_RDONLY)?])?;
-    // Signals to this process alone, as `abort` sends them.
-    let own = rustix::process::getpid().as_raw_nonzero().get().unsigned_abs();
-    allow(libc::SYS_tgkill, vec![equals(0, own.into())?])?;
-    // Limits are read and not set.
+    // Signals reach only this process; `abort` needs them.
+    let process = rustix::process::getpid().as_raw_nonzero().get().unsigned_abs();
+    allow(libc::SYS_tgkill, vec![equals(0, process.into())?])?;
+    // Limits can be read but not set.
     allow(libc::SYS_prlimit64, vec![equals(0, 0)?, equals(2, 0)?])?;
     let commands =
         [libc::F_GETFD, libc::F_SETFD, libc::F_GETFL, libc::F_DUPFD, libc::F_DUPFD_CLOEXEC];
@@ -229,8 +230,8 @@ fn network_rules() -> Result<Rules, BackendError> {
     Ok(rules)
 }
 
-/// Answers `clone3` as a kernel without it does, since its flags lie in memory, where no filter sees them: the C
-/// library then calls `clone`.
+/// Answers `clone3` like a kernel that lacks it, so that the C library calls `clone`. A filter can't see the flags of
+/// `clone3`, which lie in memory.
 fn without_clone3() -> Result<BpfProgram, BackendError> {
     filter([(libc::SYS_clone3, vec![])].into(), SeccompAction::Allow, refusal(libc::ENOSYS))
 }
@@ -239,7 +240,7 @@ fn refusal(error: libc::c_int) -> SeccompAction {
     SeccompAction::Errno(error.unsigned_abs())
 }
 
-/// A filter that answers calls by `matched` where a rule holds, and all others by `otherwise`.
+/// A filter that answers calls with `matched` if a rule applies, and with `otherwise` if none does.
 fn filter(
     rules: Rules,
     otherwise: SeccompAction,
@@ -253,19 +254,18 @@ mod tests {
     use std::path::Path;
     use std::process::Command;
 
-    use super::{confine_network, confine_worker, files_can_be_kept};
+    use super::{check_landlock, confine_network, confine_worker};
 
-    /// What a process finds that it can do, after it was confined: on a thread of its own, as both hold for a
-    /// thread and what it starts.
-    fn found<T: Send>(
+    /// Runs `action` on a thread that is confined. Confinement applies to a thread and its children.
+    fn when_confined<T: Send>(
         confine: impl FnOnce(&[&Path]) -> Result<(), String> + Send,
         folder: &Path,
-        what: impl FnOnce() -> T + Send,
+        action: impl FnOnce() -> T + Send,
     ) -> T {
         std::thread::scope(|scope| {
             let confined = scope.spawn(|| {
                 confine(&[folder]).unwrap();
-                what()
+                action()
             });
             confined.join().unwrap()
         })
@@ -273,31 +273,32 @@ mod tests {
 
     #[test]
     fn a_network_reads_no_files_makes_no_connections_and_starts_nothing() {
-        if let Err(why) = files_can_be_kept() {
-            eprintln!("SKIPPED: {why}");
+        if let Err(reason) = check_landlock() {
+            eprintln!("SKIPPED: {reason}");
             return;
         }
-        let (own, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        for folder in [&own, &other] {
+        let (allowed, denied) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        for folder in [&allowed, &denied] {
             std::fs::write(folder.path().join("file"), "text").unwrap();
         }
         let read = |folder: &Path| std::fs::read(folder.join("file")).is_ok();
-        let may = || {
+        let permissions = || {
             [
-                read(own.path()),
-                read(other.path()),
-                std::fs::write(own.path().join("new"), "text").is_ok(),
+                read(allowed.path()),
+                read(denied.path()),
+                std::fs::write(allowed.path().join("new"), "text").is_ok(),
                 std::net::UdpSocket::bind("127.0.0.1:0").is_ok(),
                 Command::new("true").status().is_ok(),
                 rustix::process::test_kill_process(rustix::process::getpid()).is_ok(),
             ]
         };
-        assert_eq!(may(), [true; 6]);
-        let found_by_network = found(confine_network, own.path(), may);
-        assert_eq!(found_by_network, [true, false, false, false, false, false]);
-        // A worker starts the processes of networks, and ends them.
-        let found_by_worker = found(|readable| confine_worker(readable, &[]), own.path(), may);
-        assert_eq!(found_by_worker, [true, false, false, false, true, true]);
-        assert_eq!(may(), [true; 6], "another thread was confined");
+        assert_eq!(permissions(), [true; 6]);
+        let network_permissions = when_confined(confine_network, allowed.path(), permissions);
+        assert_eq!(network_permissions, [true, false, false, false, false, false]);
+        // A worker must start and end the processes of networks.
+        let confine = |readable: &[&Path]| confine_worker(readable, &[]);
+        let worker_permissions = when_confined(confine, allowed.path(), permissions);
+        assert_eq!(worker_permissions, [true, false, false, false, true, true]);
+        assert_eq!(permissions(), [true; 6], "another thread was confined");
     }
 }

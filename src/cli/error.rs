@@ -13,7 +13,7 @@ use reconstruction::ReconError;
 
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
 
-/// Why a command failed, as a sentence for the user.
+/// Failure of a command. The text is for the user.
 #[derive(Debug, thiserror::Error)]
 pub enum CliError {
     /// The input can't be used; exit code 2, as for wrong arguments.
@@ -25,7 +25,7 @@ pub enum CliError {
     /// The work is done, but the checks found errors in the input; exit code 3.
     #[error("{0}")]
     ErrorsFound(String),
-    /// The reader of standard output has closed it. This is no failure.
+    /// The reader of standard output has closed it. The command then ends with success.
     #[error("standard output is closed")]
     Unread,
 }
@@ -82,7 +82,7 @@ impl From<PipelineError> for CliError {
     }
 }
 
-/// For what the user gave: a file that can't be opened is the user's to mend as well.
+/// For input. A file that can't be opened is an input error too, because the user can correct it.
 impl From<IntakeError> for CliError {
     fn from(error: IntakeError) -> Self {
         let text = error.to_string();
@@ -93,7 +93,7 @@ impl From<IntakeError> for CliError {
     }
 }
 
-/// For results.
+/// For output.
 impl From<FormatError> for CliError {
     fn from(error: FormatError) -> Self {
         Self::Failure(error.to_string())

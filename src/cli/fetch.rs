@@ -1,4 +1,4 @@
-//! `sci-recon fetch`: the results of a job.
+//! `sci-recon fetch`: downloads the results of a job.
 
 use std::path::PathBuf;
 
@@ -23,7 +23,7 @@ pub struct Arguments {
     job: JobId,
     #[command(flatten)]
     service: ServiceArguments,
-    /// Folder for the files; each snapshot has a folder there, snapshot_0000 and so on [default: the identifier
+    /// Folder for the files, with a subfolder for each snapshot, snapshot_0000 and so on [default: the identifier
     /// of the job].
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,

@@ -1,5 +1,5 @@
-//! Keeps the process of a worker for a server elsewhere running: if its task takes it down, the next
-//! process tells so, and goes on.
+//! Keeps the process of a worker on another machine running. If a task crashes the process, the next process reports the
+//! crash and continues.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -11,12 +11,11 @@ use super::CliError;
 use super::supervisor::{GRACE, HEALTHY, PAUSES, judge};
 use store::WorkerEnd;
 
-/// The exit code of a process whose settings can't be, or that a server refuses: another one would fare
-/// no better.
-const HOPELESS: i32 = 2;
+/// Exit code of a process with invalid settings, or that a server refuses. A restart would not help.
+const PERMANENT_ERROR: i32 = 2;
 
-/// Runs this program again, with the same arguments and `--supervised`, until it ends by itself or
-/// `stop` comes. `cache` is the folder in which it notes what it has in hand.
+/// Runs this program again with the same arguments and `--supervised`, until it ends normally or `stop` completes. The
+/// process records its current tile in the folder `cache`.
 pub(super) async fn guard(cache: &Path, stop: impl Future<Output = ()>) -> Result<(), CliError> {
     let failed = |error: std::io::Error| CliError::Failure(format!("no worker process: {error}"));
     let program = std::env::current_exe().map_err(failed)?;
@@ -34,16 +33,16 @@ pub(super) async fn guard(cache: &Path, stop: impl Future<Output = ()>) -> Resul
                 return end(child, &hand).await.map_err(failed);
             }
         };
-        if status.code() == Some(HOPELESS) {
-            // It has said why.
-            std::process::exit(HOPELESS);
+        if status.code() == Some(PERMANENT_ERROR) {
+            // The process has printed the reason.
+            std::process::exit(PERMANENT_ERROR);
         }
         died = match judge(status) {
             WorkerEnd::Left => return Ok(()),
             WorkerEnd::Killed => Some("killed".to_owned()),
             WorkerEnd::Starved(how) | WorkerEnd::Crashed(how) => Some(how),
         };
-        tracing::error!(how = died, "the worker process has died, and another one takes its place");
+        tracing::error!(how = died, "the worker process has died and is restarted");
         pause = if start.elapsed() > HEALTHY { PAUSES.0 } else { (pause * 2).min(PAUSES.1) };
         tokio::select! {
             () = tokio::time::sleep(pause) => {}
@@ -61,7 +60,7 @@ fn spawn(program: &Path, hand: &PathBuf, died: Option<String>) -> std::io::Resul
     command.stdin(Stdio::piped()).process_group(0).kill_on_drop(true).spawn()
 }
 
-/// Waits for a process that was told to end, and kills it if it does not.
+/// Waits for a process that was asked to stop, and kills it after [`GRACE`].
 async fn end(mut child: Child, hand: &Path) -> std::io::Result<()> {
     if tokio::time::timeout(GRACE, child.wait()).await.is_err() {
         child.kill().await?;

@@ -1,4 +1,4 @@
-//! `sci-recon health`: whether the service of a data folder is ready, for what watches a container.
+//! `sci-recon health`: asks whether the service of a data folder is ready, for the health check of a container.
 
 use std::fs;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -13,7 +13,7 @@ use super::output::print_line;
 use super::wait::wait;
 use crate::cli::error::Result;
 
-/// The longest that an answer may take.
+/// Time that the service has to answer.
 const PATIENCE: Duration = Duration::from_secs(4);
 
 /// Ask the running service whether it is ready.
@@ -34,25 +34,28 @@ struct Announcement {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let path = arguments.data.join("server.json");
     let failed = |error: &dyn std::fmt::Display| {
-        CliError::Failure(format!("no service says that it is here ({}): {error}", path.display()))
+        CliError::Failure(format!(
+            "no service runs on this data folder ({}): {error}",
+            path.display()
+        ))
     };
     let text = fs::read_to_string(&path).map_err(|error| failed(&error))?;
     let announced: Announcement = serde_json::from_str(&text).map_err(|error| failed(&error))?;
     print_line(wait(ask(announced.address))?)
 }
 
-/// What `/readyz` answers.
+/// Returns the answer of `/readyz`.
 async fn ask(address: SocketAddr) -> Result<String> {
     let broken = |error: reqwest::Error| CliError::Failure(format!("no answer: {error}"));
     let url = format!("http://{}/readyz", reachable(address));
     let client = reqwest::Client::builder().timeout(PATIENCE).no_proxy().build();
     let answer = client.map_err(broken)?.get(url).send().await.map_err(broken)?;
-    let ready = answer.status().is_success();
+    let is_ready = answer.status().is_success();
     let text = answer.text().await.map_err(broken)?;
-    if ready { Ok(text) } else { Err(CliError::Failure(text)) }
+    if is_ready { Ok(text) } else { Err(CliError::Failure(text)) }
 }
 
-/// An address of this machine at which one that listens at all of them answers.
+/// The address to connect to. A service that listens at all addresses is reached at the loopback address.
 fn reachable(address: SocketAddr) -> SocketAddr {
     let ip = match address.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
@@ -67,13 +70,13 @@ mod tests {
     use super::reachable;
 
     #[test]
-    fn a_service_that_listens_everywhere_is_asked_here() {
-        for (told, asked) in [
+    fn a_service_at_all_addresses_is_reached_at_the_loopback_address() {
+        for (listen, expected) in [
             ("0.0.0.0:80", "127.0.0.1:80"),
             ("[::]:80", "[::1]:80"),
             ("10.0.0.7:80", "10.0.0.7:80"),
         ] {
-            assert_eq!(reachable(told.parse().unwrap()), asked.parse().unwrap());
+            assert_eq!(reachable(listen.parse().unwrap()), expected.parse().unwrap());
         }
     }
 }

@@ -1,4 +1,4 @@
-//! `sci-recon job`: the jobs of all labs, for those who look after the machine.
+//! `sci-recon job`: manages the jobs of all labs, for the administrator of the machine.
 
 use std::path::PathBuf;
 
@@ -25,10 +25,10 @@ pub struct Arguments {
 enum Action {
     /// List jobs, newest first.
     List {
-        /// Only those of this lab.
+        /// Only jobs of this lab.
         #[arg(long, value_name = "NAME")]
         lab: Option<Lab>,
-        /// Only those in these states [default: all].
+        /// Only jobs in these states, separated by commas [default: all].
         #[arg(long, value_name = "STATE", value_delimiter = ',')]
         state: Vec<JobState>,
         /// Largest number of jobs.
@@ -49,7 +49,7 @@ enum Action {
     Priority {
         /// The job's identifier.
         job: JobId,
-        /// From -100 to 100; those of higher priority go first.
+        /// From -100 to 100; jobs of higher priority go first.
         #[arg(value_name = "N", allow_negative_numbers = true, value_parser = priority)]
         priority: i32,
     },
@@ -61,7 +61,7 @@ enum Action {
 }
 
 fn priority(text: &str) -> Result<i32, String> {
-    let priority = text.parse().map_err(|_| format!("{text:?} is no whole number"))?;
+    let priority = text.parse().map_err(|_| format!("{text:?} is not a whole number"))?;
     priority_error(priority).map_or(Ok(priority), |error| Err(error.detail))
 }
 
@@ -70,7 +70,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 }
 
 async fn act(store: &Store, action: &Action) -> Result<String> {
-    let of = async |id| Ok::<_, StoreError>(store.job_of_any_lab(id).await?.lab);
+    let lab_of = async |id| Ok::<_, StoreError>(store.job_of_any_lab(id).await?.lab);
     let id = match *action {
         Action::List { ref lab, ref state, limit } => {
             let states = (!state.is_empty()).then(|| state.clone());
@@ -79,21 +79,21 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
             return Ok(table(&jobs, &store.progress_of(&jobs).await?));
         }
         Action::Delete { job } => {
-            let lab = of(job).await?;
+            let lab = lab_of(job).await?;
             store.delete_job(&lab, job).await?;
             return Ok(format!("deleted {job} of {lab}"));
         }
         Action::Cancel { job } => {
-            store.cancel_job(&of(job).await?, job).await?;
+            store.cancel_job(&lab_of(job).await?, job).await?;
             job
         }
         Action::Retry { job } => {
-            store.retry_job(&of(job).await?, job).await?;
+            store.retry_job(&lab_of(job).await?, job).await?;
             job
         }
         Action::Priority { job, priority } => {
             let changes = JobChanges { priority: Some(priority), ..JobChanges::default() };
-            store.change_job(&of(job).await?, job, &changes).await?;
+            store.change_job(&lab_of(job).await?, job, &changes).await?;
             job
         }
     };
@@ -104,7 +104,7 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
 fn table(jobs: &[Job], progress: &[JobProgress]) -> String {
     let mut lines = vec![format!(
         "{:36}  {:16}  {:10}  {:>8}  {:>5}  {:24}  {:20}  label",
-        "id", "lab", "state", "priority", "done", "made", "algorithm"
+        "id", "lab", "state", "priority", "done", "created", "algorithm"
     )];
     for (job, progress) in jobs.iter().zip(progress) {
         lines.push(format!(

@@ -1,4 +1,4 @@
-//! `sci-recon lab`: the labs that a service has, their shares of the machine, their limits, and their files.
+//! `sci-recon lab`: manages labs, their shares of the machine, their quotas and their files.
 
 use std::path::PathBuf;
 
@@ -12,8 +12,8 @@ use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 
 /// Manage labs: shares, quotas and files.
 ///
-/// Tasks are handed out by priority, then to each lab in turn. While two labs have work waiting, one with
-/// twice the share gets twice the processor time.
+/// Tasks of the highest priority go first; at equal priority, labs take turns. While two labs have waiting work, the
+/// one with twice the share gets twice the processor time.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data.
@@ -32,7 +32,7 @@ enum Action {
         /// The lab's name.
         lab: Lab,
     },
-    /// Delete an upload of a lab that nothing needs.
+    /// Delete an unused upload of a lab.
     DeleteUpload {
         /// The lab's name.
         lab: Lab,
@@ -54,16 +54,16 @@ enum Action {
         /// The share of the machine, relative to the shares of other labs, which start at 1.
         #[arg(long, value_name = "N", value_parser = share, required_unless_present_any = ["bytes", "jobs"])]
         share: Option<f64>,
-        /// Bytes that the lab may store in uploads, prepared arrays and results; none: no limit.
+        /// Bytes that the lab may store in uploads, prepared arrays and results, or `none` for no limit.
         #[arg(long, value_name = "N", value_parser = limit)]
         bytes: Option<Limit>,
-        /// Jobs of the lab that may wait and run; none: only the limit of the service.
+        /// Jobs of the lab that may wait and run, or `none` for only the limit of the service.
         #[arg(long, value_name = "N", value_parser = limit)]
         jobs: Option<Limit>,
     },
 }
 
-/// A limit, or word that there is to be none.
+/// A limit, or `None` for no limit.
 #[derive(Debug, Clone, Copy)]
 struct Limit(Option<u64>);
 
@@ -72,11 +72,11 @@ fn limit(text: &str) -> Result<Limit, String> {
         return Ok(Limit(None));
     }
     let number = text.parse().ok().filter(|number| i64::try_from(*number).is_ok());
-    number.map(|number| Limit(Some(number))).ok_or_else(|| "a limit is a number, or none".into())
+    number.map(|number| Limit(Some(number))).ok_or_else(|| "a limit is a number or `none`".into())
 }
 
 fn share(text: &str) -> Result<f64, String> {
-    let share: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    let share: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
     share_error(share).map_or(Ok(share), |error| Err(error.into()))
 }
 
@@ -98,27 +98,28 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
         }
         Action::Set { lab, new, share, bytes, jobs } => {
             if !new && !store.knows_lab(lab).await? {
-                let text = format!("there is no lab {lab}; --new puts it on record");
+                let text = format!("there is no lab {lab}; create it with --new");
                 return Err(CliError::Input(text));
             }
-            let to = Entitlement {
+            let entitlement = Entitlement {
                 share: *share,
                 max_bytes: bytes.map(|limit| limit.0),
                 max_jobs: jobs.map(|limit| limit.0),
             };
-            store.entitle(lab, to).await?;
+            store.entitle(lab, entitlement).await?;
         }
     }
-    let mut rows = Vec::new();
+    let (mut rows, costs) = (Vec::new(), store.cost_left_by_lab().await?);
     for row in store.labs().await? {
         let bytes = store.lab_bytes(&row.lab).await?;
-        rows.push((row, bytes));
+        let cost_left = costs.get(&row.lab).copied().unwrap_or_default();
+        rows.push((row, bytes, cost_left));
     }
     Ok(table(&rows))
 }
 
 async fn uploads(store: &Store, lab: &Lab) -> Result<String> {
-    let mut lines = vec![format!("{:64}  {:>14}  {:24}  in use", "sha256", "bytes", "sent")];
+    let mut lines = vec![format!("{:64}  {:>14}  {:24}  in use", "sha256", "bytes", "uploaded")];
     let mut after = None;
     loop {
         let page = store.uploads(lab, after, 200).await?;
@@ -134,14 +135,14 @@ async fn uploads(store: &Store, lab: &Lab) -> Result<String> {
     }
 }
 
-fn table(labs: &[(LabRow, u64)]) -> String {
+fn table(labs: &[(LabRow, u64, f64)]) -> String {
     let head = format!(
         "{:40}  {:>8}  {:>8}  {:>8}  {:>16}  {:>16}  {:>16}",
         "lab", "share", "jobs", "of", "bytes", "of", "CPU seconds left"
     );
     let limit = |limit: Option<u64>| limit.map_or_else(|| "none".into(), |limit| limit.to_string());
-    let line = |(row, bytes): &(LabRow, u64)| {
-        let LabRow { lab, share, max_bytes, max_jobs, jobs, cost_left } = row;
+    let line = |(row, bytes, cost_left): &(LabRow, u64, f64)| {
+        let LabRow { lab, share, max_bytes, max_jobs, jobs } = row;
         format!(
             "{:40}  {share:>8}  {jobs:>8}  {:>8}  {bytes:>16}  {:>16}  {cost_left:>16.0}",
             lab.as_str(),

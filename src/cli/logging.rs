@@ -1,4 +1,4 @@
-//! Log lines: on standard error, from `info` on unless `RUST_LOG` says otherwise.
+//! Writes log lines to standard error. The default level is `info`; `RUST_LOG` overrides it.
 
 use std::io::IsTerminal;
 
@@ -6,13 +6,13 @@ use tracing_subscriber::EnvFilter;
 
 use crate::config::LogFormat;
 
-/// Begins to write log lines. A second call changes nothing.
+/// Starts logging. A second call has no effect.
 pub(crate) fn start(format: LogFormat) {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     let lines = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
-        // A line that can't be written (a log on a full disk, say) must not take a request with it.
+        // A line that can't be written, such as to a full disk, must not fail a request.
         .log_internal_errors(false)
         .with_ansi(std::io::stderr().is_terminal());
     let started = match format {
@@ -20,6 +20,6 @@ pub(crate) fn start(format: LogFormat) {
         LogFormat::Json => lines.json().try_init(),
     };
     if let Err(error) = started {
-        tracing::debug!(%error, "log lines are written already");
+        tracing::debug!(%error, "logging has already started");
     }
 }

@@ -1,4 +1,4 @@
-//! `sci-recon ls`: the jobs of a lab.
+//! `sci-recon ls`: lists the jobs of a lab.
 
 use clap::Args;
 use serde_json::{Value, json};

@@ -1,4 +1,4 @@
-//! Which masks are simulated, for all commands that simulate.
+//! The options of simulated masks, which all simulating commands share.
 
 use std::path::PathBuf;
 
@@ -15,10 +15,10 @@ use optics::{
     iid_masks, pattern_rank, single_apertures, soften,
 };
 
-/// The masks that are asked for.
+/// Options of the masks.
 #[derive(Debug, Args)]
 pub struct MaskArguments {
-    /// Kind of the masks.
+    /// Kind of masks.
     #[arg(long, default_value = "random-squares")]
     pattern: Pattern,
     /// Optical parameters as TOML (see `sci-recon optics`) [default: the paper's].
@@ -54,7 +54,7 @@ enum Pattern {
     RotatingCircle,
     /// The lithography mask seen through one sub-aperture in each frame: no multiplexing.
     SingleApertures,
-    /// The lithography mask seen through patterns of your own (--images).
+    /// The lithography mask seen through custom patterns (--images).
     Images,
 }
 
@@ -71,12 +71,12 @@ pub struct Apertures {
     rows: usize,
     columns: usize,
     rank: usize,
-    /// For each frame of a grid of sub-apertures, `1` for each open one and `0` for the others, row
-    /// by row; none for other patterns.
+    /// For each frame, `1` for each open sub-aperture and `0` for each closed one, row by row. `None` for patterns
+    /// without a grid.
     open: Option<Vec<String>>,
 }
 
-/// Masks, and where they come from.
+/// Masks, and properties of their aperture.
 pub struct SimulatedMasks {
     /// \[B,H,W\] on \[0,1\].
     pub masks: Array3<f32>,
@@ -84,7 +84,7 @@ pub struct SimulatedMasks {
     pub throughput: f64,
     /// That share where a mask is 1.
     pub scale: f32,
-    /// None for masks without an aperture.
+    /// `None` for masks without an aperture.
     pub apertures: Option<Apertures>,
 }
 
@@ -99,7 +99,7 @@ impl MaskArguments {
         }
     }
 
-    /// The pattern and what a lens and closed pixels make of it, as `iid, blur 0.7, leak 0.1`.
+    /// The pattern, the blur and the leak as text, such as `iid, blur 0.7, leak 0.1`.
     pub fn described(&self) -> String {
         let mut text = self.pattern().to_owned();
         if self.blur != 0.0 {
@@ -111,12 +111,12 @@ impl MaskArguments {
         text
     }
 
-    /// Standard deviation of the lens's blur, sensor pixels.
+    /// Standard deviation of the lens's blur in sensor pixels.
     pub fn blur(&self) -> f64 {
         self.blur
     }
 
-    /// The share of light that closed pixels let through.
+    /// Share of light that closed pixels transmit.
     pub fn leak(&self) -> f32 {
         self.leak
     }
@@ -125,18 +125,18 @@ impl MaskArguments {
         OpticsFile::read(self.optics.as_deref())
     }
 
-    /// Makes the masks of frames x rows x columns.
+    /// Simulates masks of frames x rows x columns.
     pub fn make(
         &self,
         optics: &OpticsFile,
         size: (usize, usize, usize),
         seed: u64,
     ) -> Result<SimulatedMasks> {
-        let made = self.sharp(optics, size, seed)?;
+        let sharp = self.sharp(optics, size, seed)?;
         if self.blur == 0.0 && self.leak == 0.0 {
-            return Ok(made);
+            return Ok(sharp);
         }
-        let SimulatedMasks { mut masks, mut scale, apertures, .. } = made;
+        let SimulatedMasks { mut masks, mut scale, apertures, .. } = sharp;
         soften(&mut masks, self.blur, self.leak)?;
         if self.normalise == Normalise::Maximum {
             let largest = masks.iter().copied().fold(0.0, f32::max);
@@ -149,7 +149,7 @@ impl MaskArguments {
         Ok(SimulatedMasks { masks, throughput, scale, apertures })
     }
 
-    /// The masks as the patterns and the aperture alone make them.
+    /// Simulates the masks without blur and leak.
     fn sharp(
         &self,
         optics: &OpticsFile,
@@ -172,11 +172,11 @@ impl MaskArguments {
                 Multiplexing::random(frames, grid.count(), draw, &mut rng)?.patterns(grid)
             }
         };
-        let made = self.aperture(optics)?.masks(patterns.view(), (height, width), &mut rng)?;
+        let projected = self.aperture(optics)?.masks(patterns.view(), (height, width), &mut rng)?;
         Ok(SimulatedMasks {
-            masks: made.masks,
-            throughput: made.throughput,
-            scale: made.scale,
+            masks: projected.masks,
+            throughput: projected.throughput,
+            scale: projected.scale,
             apertures: Some(self.apertures(&patterns)),
         })
     }

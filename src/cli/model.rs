@@ -1,4 +1,4 @@
-//! The network of a user's own on the command line.
+//! A user's network on the command line.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ pub struct Model {
 }
 
 impl Model {
-    /// Loads the network once, to see what it takes.
+    /// Loads the network once to learn its inputs and outputs.
     pub fn open(path: &Path, network: &NetworkSource) -> Result<Self> {
         let file = ModelFile::open(path).map_err(|error| CliError::Input(error.to_string()))?;
         let interface = network.end_to_end(&file.content()?)?.interface();
@@ -24,7 +24,7 @@ impl Model {
         Ok(Self { name, file, interface })
     }
 
-    /// Which pictures it takes, for masks of frames x rows x columns.
+    /// The sizes of pictures that the network accepts for masks of frames x rows x columns.
     pub fn size(&self, (frames, height, width): (usize, usize, usize)) -> Result<PictureSize> {
         Ok(self.interface.check(frames, height, width)?)
     }
@@ -34,8 +34,8 @@ impl Model {
     }
 }
 
-/// How snapshots of frames x rows x columns are cut: as asked for, else as the algorithm or the network
-/// wants it.
+/// Decides how snapshots of frames x rows x columns are cut. The user's values precede the defaults of the algorithm and
+/// the network.
 pub fn cut(
     (algorithm, schedule): (Algorithm, &Schedule),
     (tile, overlap): (Option<usize>, Option<usize>),
@@ -45,8 +45,8 @@ pub fn cut(
 ) -> Result<Cut> {
     let (_, height, width) = dim;
     let fixed = model.map(|model| model.size(dim)).transpose()? == Some(PictureSize::Fixed);
-    let usual = if fixed { TileSpec::whole(height, width) } else { algorithm.default_tile() };
-    let (size, overlap) = (tile.unwrap_or(usual.size), overlap.unwrap_or(usual.overlap));
+    let default = if fixed { TileSpec::whole(height, width) } else { algorithm.default_tile() };
+    let (size, overlap) = (tile.unwrap_or(default.size), overlap.unwrap_or(default.overlap));
     let (sequence, snapshots) = sequence;
     let tile_is_fixed = fixed || tile.is_some();
     let tile = TileSpec { size, overlap };

@@ -1,4 +1,4 @@
-//! The file of optical parameters, and `sci-recon optics`, which prints and checks it.
+//! Files of optical parameters, and `sci-recon optics`, which prints and checks them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -16,15 +16,15 @@ const DEFAULTS: &str = include_str!("../../docs/optics.toml");
 
 /// Print the optical parameters of `simulate`.
 ///
-/// Prints the defaults as a commented TOML file, or the quantities that follow from a file of your own.
+/// Prints the defaults as a commented TOML file, or the quantities that are derived from a file.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Check this file and print, as JSON, all parameters and what follows from them.
+    /// Check this file and print all parameters and derived quantities as JSON.
     #[arg(long, value_name = "FILE")]
     check: Option<PathBuf>,
 }
 
-/// Everything that a file of optical parameters says.
+/// The content of a file of optical parameters.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OpticsFile {
@@ -134,7 +134,7 @@ struct Light {
 }
 
 impl OpticsFile {
-    /// Reads and checks a file; without one these are the defaults.
+    /// Reads and checks a file. Without a path, returns the defaults.
     pub(super) fn read(path: Option<&Path>) -> Result<Self> {
         let Some(path) = path else { return Ok(Self::default()) };
         let text = fs::read_to_string(path).map_err(|error| refused(path, &error))?;
@@ -177,13 +177,13 @@ impl OpticsFile {
         }
     }
 
-    /// How random squares are drawn on a grid.
+    /// Parameters of random squares on a grid.
     pub(super) fn draw(&self, grid: ApertureGrid) -> Result<Draw> {
         let SubApertures { open_share, rank, tries, .. } = self.sub_apertures;
         if !(open_share > 0.0 && open_share <= 1.0) {
             return Err(CliError::Input(format!(
-                "sub_apertures open_share is {open_share}; it must be above 0 and at most 1: no more \
-                 sub-apertures can be open than there are"
+                "sub_apertures open_share is {open_share}; it is the open share of the sub-apertures and must be \
+                above 0 and at most 1"
             )));
         }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most the count
@@ -196,10 +196,10 @@ fn refused(path: &Path, error: &dyn std::fmt::Display) -> CliError {
     CliError::Input(format!("optics {}: {error}", path.display()))
 }
 
-/// What `--check` prints beside the parameters.
+/// The derived quantities that `--check` prints.
 #[derive(Debug, Serialize)]
 struct Derived {
-    /// By how much the mask's projection moves from the first to the last row of the LCoS.
+    /// Shift of the mask's projection from the first to the last row of the LCoS.
     shift_over_lcos_rows_mask_pixels: f64,
     shift_over_lcos_columns_mask_pixels: f64,
     shift_per_lcos_pixel_mask_pixels: f64,
@@ -230,12 +230,12 @@ mod tests {
     use super::{DEFAULTS, OpticsFile};
 
     #[test]
-    fn the_printed_file_holds_the_defaults() {
+    fn the_printed_file_contains_the_defaults() {
         let file: OpticsFile = toml::from_str(DEFAULTS).unwrap();
         assert_eq!(file, OpticsFile::default());
-        // And it names every number that there is, also those that have no default.
-        let all = serde_json::to_value(&file).unwrap();
-        for (section, fields) in all.as_object().unwrap() {
+        // The file names every parameter, even without a default.
+        let values = serde_json::to_value(&file).unwrap();
+        for (section, fields) in values.as_object().unwrap() {
             assert!(DEFAULTS.contains(&format!("[{section}]")), "{section}");
             for field in fields.as_object().unwrap().keys() {
                 assert!(DEFAULTS.contains(&format!("{field} = ")), "{section}.{field}");
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_can_not_be_are_refused_with_their_name() {
+    fn an_invalid_file_is_refused_with_its_name() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("optics.toml");
         let read = |text: &str| {

@@ -1,4 +1,4 @@
-//! The one place that prints to standard output.
+//! Prints to standard output. No other module does.
 
 use std::fmt::Display;
 use std::io::{ErrorKind, Write};
@@ -6,7 +6,7 @@ use std::io::{ErrorKind, Write};
 use super::CliError;
 use super::error::Result;
 
-/// Prints text as it is.
+/// Prints text without a line feed.
 /// Errors: [`CliError::Unread`] if the reader, such as `head`, has closed the pipe.
 pub(super) fn print_text(text: impl Display) -> Result<()> {
     let mut stdout = std::io::stdout().lock();

@@ -1,4 +1,4 @@
-//! A progress bar, on a terminal only.
+//! Progress bars, which appear only on a terminal.
 
 use std::borrow::Cow;
 use std::io::IsTerminal;
@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 const STEPS: u64 = 1000;
 
-/// Standard error if it is a terminal, else nothing.
+/// Standard error if it is a terminal, else a hidden target.
 pub(super) fn target() -> ProgressDrawTarget {
     match std::io::stderr().is_terminal() {
         true => ProgressDrawTarget::stderr(),
@@ -24,7 +24,7 @@ pub(super) fn bar(title: impl Into<Cow<'static, str>>) -> ProgressBar {
     bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// A bar of bytes, whose number is told later.
+/// A bar of bytes. Its length is set later.
 pub(super) fn bytes(title: impl Into<Cow<'static, str>>) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(None, target()).with_message(title);
     let style = "{msg:>24} {wide_bar} {decimal_bytes}/{decimal_total_bytes} {eta:>4}";
@@ -47,7 +47,7 @@ impl SnapshotBar {
         Self { bar: bar("reconstructing"), shares: Mutex::new(vec![0.0; tiles]) }
     }
 
-    /// Shows that a share of the work of a tile is done, on \[0,1\].
+    /// Updates the finished share of a tile, on \[0,1\].
     pub(super) fn update(&self, tile: usize, share: f64) {
         let Ok(mut shares) = self.shares.lock() else { return };
         if let Some(done) = shares.get_mut(tile) {

@@ -1,4 +1,4 @@
-//! `sci-recon reconstruct`: snapshots, without a server.
+//! `sci-recon reconstruct`: reconstructs snapshots without a server.
 
 use std::fs::{self, File};
 use std::io::BufWriter;
@@ -42,26 +42,26 @@ pub struct Arguments {
     /// Masks, one frame each: npy, TIFF, PNG, or a scene's `mask`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     masks: Option<PathBuf>,
-    /// Measurement, one frame a snapshot: npy, TIFF, PNG, or a scene's `meas`.
+    /// Measurement, one frame per snapshot: npy, TIFF, PNG, or a scene's `meas`.
     #[arg(long, value_name = "FILE", required_unless_present = "scene")]
     measurement: Option<PathBuf>,
     /// True frames to compare with, of the reconstructed or of all snapshots.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// A scene, npz, .mat or HDF5, with `mask`, `meas` and perhaps `orig`, instead of the three files.
+    /// A scene (npz, .mat or HDF5) with `mask`, `meas` and optionally `orig`, instead of the three files.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["masks", "measurement", "truth"])]
     scene: Option<PathBuf>,
-    /// The snapshots, counted from 0: one, a range with both ends in, or all.
+    /// The snapshots, counted from 0: one, a range including both ends, or all.
     #[arg(long, alias = "snapshot", value_name = "N|FIRST-LAST|all", default_value = "0")]
     snapshots: Snapshots,
-    /// `contiguous` snapshots follow one another without a gap and are reconstructed together where that helps,
-    /// `separate` ones each alone.
+    /// `contiguous` if the snapshots follow one another without a gap; they are reconstructed together where that helps.
+    /// `separate` reconstructs each alone.
     #[arg(long, default_value_t = Sequence::Contiguous, value_parser = sequence())]
     sequence: Sequence,
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE")]
     dark: Vec<PathBuf>,
-    /// The stored number from which on a pixel is saturated [default: the largest of its type].
+    /// The stored number at and above which a pixel is saturated [default: the largest of its type].
     #[arg(long, value_name = "NUMBER")]
     saturation: Option<u32>,
     /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
@@ -75,8 +75,8 @@ pub struct Arguments {
     /// Value in the truth's file that means 1 [default: as for the measurement].
     #[arg(long, value_name = "VALUE")]
     truth_full_scale: Option<f32>,
-    /// The colours of the sensor's pixels, row by row of a cell of 2x2. Frames have colours then; the truth may
-    /// have them ([frame, row, column, 3]) or be a mosaic [default: a grey sensor].
+    /// The colours of the sensor's pixels, row by row of a 2x2 cell. The frames then have colours; the truth may have
+    /// colours ([frame, row, column, 3]) or be a mosaic [default: a grey sensor].
     #[arg(long, value_name = "NAME", value_parser = mosaic())]
     mosaic: Option<Mosaic>,
     /// The order of the axes in the masks' file [default: the only one that fits].
@@ -97,8 +97,8 @@ pub struct Arguments {
     model: Option<PathBuf>,
     #[command(flatten)]
     engine: NetworkArguments,
-    /// Networks of your own instead of the built-in ones: a folder with fastdvdnet-gray/stage1.onnx and
-    /// stage2.onnx, or ffdnet-gray/model.onnx. The manifest has their hashes.
+    /// Folder with networks that replace the built-in ones: fastdvdnet-gray/stage1.onnx and stage2.onnx, or
+    /// ffdnet-gray/model.onnx. The manifest has their hashes.
     #[arg(long, value_name = "FOLDER")]
     models: Option<PathBuf>,
     /// Tiles solved at the same time [default: the number of cores].
@@ -111,8 +111,8 @@ pub struct Arguments {
     /// Least overlap of neighbouring tiles in pixels [default: 32; 16 for TV alone; 0 for the whole picture].
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
-    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json. If there are several
-    /// snapshots, each has a folder there, snapshot_0000 and so on.
+    /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json. Several snapshots have a
+    /// subfolder each, snapshot_0000 and so on.
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     /// Print one JSON object.
@@ -120,7 +120,7 @@ pub struct Arguments {
     json: bool,
 }
 
-/// Algorithm and plan for the input.
+/// The algorithm and the plan for the input.
 struct Setup {
     algorithm: Algorithm,
     schedule: Schedule,
@@ -172,45 +172,47 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         mosaic: arguments.mosaic,
     };
     let bar = SnapshotBar::new(setup.plan.len() * setup.runs.runs().len());
-    let tell = |tile, share| bar.update(tile, share);
-    let solved = solve(&sequence, &setup.network, setup.threads, &tell)?;
+    let report_progress = |tile, share| bar.update(tile, share);
+    let solved = solve(&sequence, &setup.network, setup.threads, &report_progress)?;
     drop(bar);
     let seconds = started.elapsed().as_secs_f64();
     let cpu_seconds = cpu_seconds() - before;
 
-    let deep = setup.model.is_some() || setup.schedule.needs_network();
-    let onnxruntime = deep && arguments.out.is_some();
+    let uses_network = setup.model.is_some() || setup.schedule.needs_network();
+    let records_version = uses_network && arguments.out.is_some();
     let cost = CostRecord {
-        provider: deep.then(|| setup.network.provider().into()),
-        onnxruntime: if onnxruntime { Some(setup.network.version()?) } else { None },
+        provider: uses_network.then(|| setup.network.provider().into()),
+        onnxruntime: if records_version { Some(setup.network.version()?) } else { None },
         cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };
     let run = RunRecord::ended(None, cost, Some(seconds));
     let frames = sequence.masks.dim().0;
-    let seen = |index| solved.frame(&sequence, input.first + index / frames, index % frames);
+    let solved_frame =
+        |index| solved.frame(&sequence, input.first + index / frames, index % frames);
     let compare = |(truth, channels): &(Array3<f32>, Channels)| {
         let frame = |index| match (arguments.mosaic, channels) {
-            (Some(mosaic), Channels::Rgb) => mosaic.demosaick(seen(index).view(), (0, 0)),
-            _ => seen(index),
+            (Some(mosaic), Channels::Rgb) => mosaic.demosaick(solved_frame(index).view(), (0, 0)),
+            _ => solved_frame(index),
         };
         Quality::compare(frame, truth.view(), *channels)
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
     let recipe = input.recipe(&setup, white, &solved)?;
     let expected = |snapshot| {
-        let told = solved.assessments(&sequence, snapshot, &recipe.schedule);
-        recipe.expected(snapshot, &told)
+        let assessments = solved.assessments(&sequence, snapshot, &recipe.schedule);
+        recipe.expected(snapshot, &assessments)
     };
     let expected: Vec<_> = input.snapshots().map(expected).collect();
     let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
-    let all = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
-    report.assessment = Assessment::combined(all);
+    let assessments = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
+    report.assessment = Assessment::combined(assessments);
     report.findings = verdict::merge(&input.findings, report.assessment.as_ref());
     for (snapshot, folder) in folders {
         let tiles = solved.records(&sequence, snapshot);
         let expected = expected.get(snapshot - input.first).cloned().flatten();
-        let (assessment, error) = expected.map(|found| (found.assessment, found.error)).unzip();
+        let (assessment, error) =
+            expected.map(|expected| (expected.assessment, expected.error)).unzip();
         let manifest = recipe.snapshot(snapshot, tiles, assessment, run.clone());
         let frame = |k| solved.frame(&sequence, snapshot, k);
         write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
@@ -219,7 +221,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     verdict::refuse_errors([&*report.findings])
 }
 
-/// Where the frames of each snapshot go.
+/// The output folder of each snapshot.
 fn folders(out: Option<&Path>, snapshots: &Range<usize>) -> Vec<(usize, PathBuf)> {
     let Some(out) = out else { return Vec::new() };
     let folder = |snapshot| match snapshots.len() {
@@ -234,7 +236,7 @@ fn model(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Model>
     match arguments.schedule.algorithm {
         Algorithm::Learned => Model::open(path, network).map(Some),
         other => Err(CliError::Input(format!(
-            "{} takes no --model; ask for --algorithm learned",
+            "{} takes no --model; use --algorithm learned",
             other.into_str()
         ))),
     }
@@ -250,7 +252,7 @@ impl<'a> Sources<'a> {
     fn new(arguments: &'a Arguments) -> Result<Self> {
         let scene = arguments.scene.as_deref();
         let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
-        let missing = || CliError::Input("name --masks and --measurement, or a --scene".into());
+        let missing = || CliError::Input("give --masks and --measurement, or --scene".into());
         Ok(Self {
             masks: Source::file(
                 named(&arguments.masks).ok_or_else(missing)?,
@@ -282,7 +284,7 @@ struct Input<'a> {
     masks: Scaled<Array3<f32>>,
     /// \[S,H,W\].
     measurement: Scaled<Array3<f32>>,
-    /// The index of the first of them in the file.
+    /// Index of the first snapshot in the file.
     first: usize,
     truth: Option<(Array3<f32>, Channels)>,
     mosaic: Option<Mosaic>,
@@ -326,12 +328,12 @@ impl<'a> Input<'a> {
             }
             None => None,
         };
-        let darkened = !dark.is_empty();
-        let both = (masks.array.view(), measurement.array.view());
+        let has_dark = !dark.is_empty();
+        let arrays = (masks.array.view(), measurement.array.view());
         let mut findings = read.passed.findings;
-        let judged = judge(both, mosaic, read.passed.saturated.as_deref(), darkened)?;
+        let judged = judge(arrays, mosaic, read.passed.saturated.as_deref(), has_dark)?;
         findings.extend(judged.into_iter().map(|finding| {
-            // Counted from the first snapshot of the file.
+            // Findings count from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
             Finding { snapshot, ..finding }
         }));
@@ -344,12 +346,12 @@ impl<'a> Input<'a> {
         SceneShape { frames, height, width, snapshots, mosaic: self.mosaic }
     }
 
-    /// The snapshots, by their indices in the file.
+    /// Indices of the snapshots in the file.
     fn snapshots(&self) -> Range<usize> {
         self.first..self.first + self.measurement.array.dim().0
     }
 
-    /// The white level of all snapshots, as a job has it.
+    /// The common white level of all snapshots, as in a job.
     fn white(&self) -> Result<f32> {
         Ok(white(self.masks.array.view(), self.measurement.array.view())?)
     }
@@ -384,19 +386,19 @@ impl<'a> Input<'a> {
     }
 }
 
-/// Runs the checks of the service on masks \[B,H,W\] and snapshots \[S,H,W\]. They read prepared files, as
-/// the service has them.
+/// Runs the checks of the service on masks \[B,H,W\] and snapshots \[S,H,W\]. The checks read prepared files, so the
+/// arrays are written to temporary ones.
 fn judge(
     (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
     mosaic: Option<Mosaic>,
     saturated: Option<&[f64]>,
-    darkened: bool,
+    has_dark: bool,
 ) -> Result<Vec<Finding>> {
     let limits = Limits::default();
     let prepared = [prepare(masks)?, prepare(snapshots)?];
-    let both = (prepared[0].path(), prepared[1].path());
-    let mut findings = intake::judge(both, mosaic, saturated, darkened, &limits)?;
-    let report = intake::report(&planar::Reader::open(both.0, &limits)?, &mut |_| true)?;
+    let paths = (prepared[0].path(), prepared[1].path());
+    let mut findings = intake::judge(paths, mosaic, saturated, has_dark, &limits)?;
+    let report = intake::report(&planar::Reader::open(paths.0, &limits)?, &mut |_| true)?;
     findings.extend(report.report.warning());
     Ok(findings)
 }
@@ -420,13 +422,13 @@ fn write(
 ) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(failed)?;
-    // If writing fails, an earlier result stays.
-    let made = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
-    write_result(made.path(), manifest, error, |k| Ok(frame(k)))?;
-    Ok(replace_result(made.path(), out)?)
+    // If writing fails, an earlier result remains.
+    let draft = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
+    write_result(draft.path(), manifest, error, |k| Ok(frame(k)))?;
+    Ok(replace_result(draft.path(), out)?)
 }
 
-/// What `--json` prints.
+/// The object that `--json` prints.
 #[derive(Debug, Serialize)]
 struct Report {
     algorithm: &'static str,
@@ -436,9 +438,9 @@ struct Report {
     height: usize,
     width: usize,
     psnr_db: Option<f64>,
-    /// How good the frames are, as far as that can be told without a truth: the mean over the snapshots.
+    /// The predicted quality of the frames, as a mean over the snapshots.
     assessment: Option<Assessment>,
-    /// PSNR of each snapshot, where the truth is known.
+    /// PSNR of each snapshot. Empty if the truth is unknown.
     psnr_db_by_snapshot: Vec<f64>,
     ssim: Option<f64>,
     seconds: f64,
@@ -447,19 +449,19 @@ struct Report {
     tv_iterations: usize,
     cpu_seconds: f64,
     peak_rss_bytes: u64,
-    /// None for a schedule without a network.
+    /// `None` for a schedule without a network.
     provider: Option<String>,
     stop_reason: String,
     /// The first and the last snapshot of each run that was reconstructed together.
     runs: Vec<[usize; 2]>,
-    /// How an adaptive schedule was decided, and which snapshots belong together.
+    /// The pilot's decisions on an adaptive schedule and on the cuts between snapshots.
     pilot: Option<PilotRecord>,
     /// Findings of the checks, and further reasons of the assessment.
     findings: Vec<Finding>,
 }
 
 impl Report {
-    /// Of snapshots, and of their frames if the truth is known.
+    /// Summarizes the results. `quality` is `None` if the truth is unknown.
     fn new(
         recipe: &Recipe,
         input: &SequenceInput<'_>,
@@ -472,8 +474,9 @@ impl Report {
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
         let summary = Summary::of(&tiles);
         let by_frame = quality.as_ref().map_or(&[][..], |quality| &quality.frames);
-        let mean =
-            |of: &[FrameQuality]| of.iter().map(|frame| frame.psnr).sum::<f64>() / of.len() as f64;
+        let mean = |frames: &[FrameQuality]| {
+            frames.iter().map(|frame| frame.psnr).sum::<f64>() / frames.len() as f64
+        };
         Self {
             algorithm: recipe.algorithm.into_str(),
             snapshots,
@@ -539,7 +542,7 @@ impl Report {
                 "snapshots {} and {}: {}, error at held-out pixels {} alone, {} together",
                 joint.after,
                 joint.after + 1,
-                if joint.together { "together" } else { "apart" },
+                if joint.together { "together" } else { "separate" },
                 error(joint.error_alone),
                 error(joint.error_together),
             ))?;

@@ -1,4 +1,4 @@
-//! `sci-recon run-model`: a network of a user's, for the worker that started this.
+//! `sci-recon run-model`: runs a user's network for the worker that started the process.
 
 use std::io::ErrorKind;
 
@@ -9,14 +9,14 @@ use super::arguments::NetworkArguments;
 use crate::cli::error::Result;
 use workers::answer_worker;
 
-/// Runs a network for a worker, which tells it all on standard input.
+/// Run a network for a worker, which sends all input to standard input.
 #[derive(Debug, Args)]
 #[command(hide = true)]
 pub struct Arguments {
-    /// The most memory that it may take [default: no limit].
+    /// Memory limit of the process [default: no limit].
     #[arg(long, value_name = "BYTES")]
     memory_bytes: Option<u64>,
-    /// Leaves it all files and connections that its user may have.
+    /// Do not restrict the files and connections of the process.
     #[arg(long)]
     unconfined: bool,
     #[command(flatten)]
@@ -28,8 +28,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let Arguments { memory_bytes, unconfined, engine } = arguments;
     engine.confine(*memory_bytes, *unconfined, None)?;
     match answer_worker(&engine.network()?) {
-        // The worker is gone.
+        // The worker has ended.
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
-        ended => ended.map_err(|error| CliError::Failure(error.to_string())),
+        result => result.map_err(|error| CliError::Failure(error.to_string())),
     }
 }

@@ -1,4 +1,4 @@
-//! `sci-recon schedule`: the default schedule of an algorithm, to be edited.
+//! `sci-recon schedule`: prints the default schedule of an algorithm, for editing.
 
 use clap::Args;
 use serde_json::json;
@@ -9,8 +9,8 @@ use crate::cli::error::Result;
 
 /// Print the schedule of an algorithm as JSON.
 ///
-/// Edit it and pass it as --schedule, or as the field `schedule` of a job. With --schedule it checks a file of
-/// your own.
+/// Edit it and pass it as --schedule, or as the field `schedule` of a job. With --schedule, the command checks that
+/// file.
 #[derive(Debug, Args)]
 pub struct Arguments {
     #[command(flatten)]

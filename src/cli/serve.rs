@@ -1,4 +1,4 @@
-//! `sci-recon serve`: the API and its workers, until it is told to stop.
+//! `sci-recon serve`: runs the API and its workers until a signal stops it.
 
 use std::io::Write;
 use std::net::SocketAddr;
@@ -24,9 +24,9 @@ use workers::nats::{
     Access, ClusterError, Credential, Hub, HubSettings, Program, describe_metrics,
 };
 
-/// How long open requests may take to end at a shutdown.
+/// Time that open requests have to end at a shutdown.
 const DRAIN: Duration = Duration::from_secs(20);
-/// The file in the data folder that says where the service listens.
+/// The file in the data folder with the address of the service.
 const ADDRESS_FILE: &str = "server.json";
 
 #[derive(Debug, thiserror::Error)]
@@ -44,7 +44,7 @@ pub enum ServeError {
     #[cfg(feature = "nats")]
     #[error(transparent)]
     Cluster(#[from] ClusterError),
-    #[error("can't count figures: {0}")]
+    #[error("can't collect metrics: {0}")]
     Metrics(#[from] metrics_exporter_prometheus::BuildError),
 }
 
@@ -59,15 +59,19 @@ pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
 }
 
 async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
-    // 1. The store, for this server alone.
+    // 1. Open the store exclusively.
     let accept_database = settings.accept_database;
     let store = Store::open(&settings.data, Purpose::Serve { accept_database }).await?;
     settings.check(store.is_open().await?)?;
-    // 2. What an earlier server left.
+    // 2. Clean up after an earlier server.
     let swept = store.dir().sweep_tmp()?;
+    store.finish_removals().await?;
     store.quarantine_orphans(accept_database).await?;
     store.forget_workers(Duration::from_secs(60)).await?;
-    // 3. The address, for those who wait for it; who has it may send a signal.
+    let half = store.dir().disk()?.1 / 2;
+    let lab_jobs = settings.lab_jobs.unwrap_or(settings.max_jobs);
+    store.set_default_limits(settings.lab_bytes.unwrap_or(half), lab_jobs).await?;
+    // 3. Announce the address. The reader may send a signal at once, so signals are handled first.
     let signal = stop_signal().map_err(io("listen for signals"))?;
     let listener = TcpListener::bind(settings.listen)
         .await
@@ -75,16 +79,16 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let address = listener.local_addr().map_err(io("learn the address"))?;
     if let Err(missing) = settings.engine.check_library() {
         tracing::error!(
-            "{missing}. Until then jobs with networks are refused; /readyz says so, too"
+            "{missing}. Until then, jobs with networks are refused; /readyz reports it too"
         );
     }
     let confinement = confinement(&settings.engine);
-    if let Err(why) = &confinement {
-        tracing::warn!("{why}");
+    if let Err(reason) = &confinement {
+        tracing::warn!("{reason}");
     }
     tracing::info!(%address, data = %store.dir().root().display(), swept, "listening");
     announce(store.dir().root(), address)?;
-    // 4. Workers and maintenance, until the signal.
+    // 4. Run workers and maintenance until the signal.
     let (stopper, stop) = watch::channel(false);
     let metrics = Metrics::install()?;
     let program = std::env::current_exe().map_err(io("find this program"))?;
@@ -98,13 +102,13 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     #[cfg(not(feature = "nats"))]
     let trouble = None;
     let mut lines = vec![workers.clone(); settings.worker_count()];
-    // Clients wait for the check of their uploads, which must not wait for tiles.
+    // Clients wait for the checks of their uploads, so these must not wait for tiles.
     let engine = EngineArguments { nice: 0, ..workers.engine.clone() };
     lines.push(WorkerArguments { takes: Takes::Light, engine, ..workers });
     let supervisor = Supervisor::start(&store, &program, lines, &stop);
     let closing = CancellationToken::new();
-    let figures = metrics.clone();
-    let maintenance = maintain(store.clone(), move || figures.upkeep(), settings.clone());
+    let folded = metrics.clone();
+    let maintenance = maintain(store.clone(), move || folded.upkeep(), settings.clone());
     tokio::spawn(closing.clone().run_until_cancelled_owned(maintenance));
     if settings.scrub_bytes > 0 {
         let (store, rate) = (store.clone(), settings.scrub_bytes);
@@ -115,29 +119,29 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     tokio::spawn(async move {
         signal.await;
         closer.cancel();
-        // Fails only if nobody listens any more.
+        // Fails only if all receivers have ended.
         let _ = stopper.send(true);
     });
-    // 5. The API.
+    // 5. Serve the API.
     let app = App::new(store.clone(), settings, metrics, (trouble, confinement), closing);
     let service = router(app);
     tokio::select! {
         () = listen(listener, service, settings, stopped(stop.clone())) => {}
-        () = too_late(stop) => tracing::warn!("requests were broken off at the shutdown"),
+        () = drain_time_over(stop) => tracing::warn!("requests were interrupted by the shutdown"),
     }
-    // 6. The end: workers of this machine give their tasks back; those of others go on.
+    // 6. Shut down. Workers of this machine return their tasks; workers on others continue.
     #[cfg(feature = "nats")]
     drop(hub);
     supervisor.ended().await;
     store.advance_generation().await?;
-    // It only tells where the service was.
+    // The file is only information. A failure to remove it is harmless.
     let _ = std::fs::remove_file(store.dir().root().join(ADDRESS_FILE));
     store.close().await;
     tracing::info!("stopped");
     Ok(())
 }
 
-/// Says where the service listens: one JSON line on standard output, and the same in a file.
+/// Announces the address of the service as one JSON line on standard output and in a file.
 fn announce(root: &Path, address: SocketAddr) -> Result<(), ServeError> {
     let text = serde_json::json!({
         "address": address.to_string(),
@@ -152,7 +156,7 @@ fn announce(root: &Path, address: SocketAddr) -> Result<(), ServeError> {
     writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(io("print the address"))
 }
 
-/// What a worker may take in fact, of address space, where this much was planned at most of resident memory.
+/// Limit of a worker's address space in bytes, for the largest planned resident memory.
 fn allowance(planned: u64) -> u64 {
     planned.saturating_add(planned / 4).saturating_add(256 << 20)
 }
@@ -163,7 +167,7 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
         #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
         takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
-        // A GPU's driver maps far more than it uses.
+        // The driver of a GPU maps far more memory than it uses.
         memory_bytes: (settings.engine.device == "cpu")
             .then(|| allowance(settings.worker_memory_bytes)),
         engine: settings.engine.clone(),
@@ -173,7 +177,7 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
     }
 }
 
-/// Begins to hand tiles out to other machines, if that is wanted.
+/// Starts to hand out tiles to other machines, if a NATS server is configured.
 #[cfg(feature = "nats")]
 async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>, ServeError> {
     let ClusterArguments { nats, ack_wait, verify_fraction } = &settings.cluster;
@@ -193,7 +197,7 @@ async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>
     Ok(Some(Hub::start(store.clone(), access, settings)))
 }
 
-/// Listens for SIGTERM and Ctrl-C from now on; the future ends with the first.
+/// Starts to listen for SIGTERM and Ctrl-C. The future completes at the first one.
 fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
@@ -206,11 +210,11 @@ fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
 }
 
 async fn stopped(mut stop: watch::Receiver<bool>) {
-    // An error means that the sender is gone, which is a stop as well.
+    // An error means that the sender was dropped, which is a stop as well.
     let _ = stop.wait_for(|stop| *stop).await;
 }
 
-async fn too_late(stop: watch::Receiver<bool>) {
+async fn drain_time_over(stop: watch::Receiver<bool>) {
     stopped(stop).await;
     tokio::time::sleep(DRAIN).await;
 }

@@ -68,15 +68,15 @@ pub fn expand(root: &Command, line: Vec<OsString>) -> Result<Expanded> {
     {
         expanded.extend_from_slice(&rest[..end]);
         rest = &rest[end..];
-        let given = passed_on(command, set);
-        if let Some((option, _)) = given.iter().find(|(key, _)| option(below, key).is_none()) {
+        let passed = passed_on(command, set);
+        if let Some((option, _)) = passed.iter().find(|(key, _)| option(below, key).is_none()) {
             let text = format!("{name} takes no --{option}; see sci-recon {name} --help");
             return Err(CliError::Input(text));
         }
         names.push(name);
         for arg in options(below).filter(|arg| !is_on_line(arg, set_below)) {
             let key = arg.get_long().unwrap_or_default();
-            if let Some((_, value)) = given.iter().find(|(given, _)| given == key) {
+            if let Some((_, value)) = passed.iter().find(|(name, _)| name == key) {
                 let mut token = OsString::from(format!("--{key}="));
                 token.push(value);
                 expanded.push(token);
@@ -131,7 +131,7 @@ pub fn show(
     Ok(lines.join("\n"))
 }
 
-/// Origin of an option that nobody sets.
+/// Origin of an option that is not set.
 const DEFAULT: &str = "the default";
 
 /// Value and origin of an option.
@@ -158,7 +158,7 @@ fn setting(arg: &Arg, set: &ArgMatches, file: Option<&File>, names: &[&str]) -> 
     (if value.is_empty() { "-".to_owned() } else { value }, DEFAULT.to_owned())
 }
 
-/// Parses as far as the line is right, so that it also works while required options are missing.
+/// Parses the valid part of a line, so that it also works while required options are missing.
 fn lenient(root: &Command, line: &[OsString]) -> Result<ArgMatches, clap::Error> {
     root.clone().ignore_errors(true).try_get_matches_from(line)
 }
@@ -170,8 +170,8 @@ fn path_in(matches: &ArgMatches) -> Option<PathBuf> {
     matches.subcommand().and_then(|(_, below)| path_in(below)).or(path)
 }
 
-/// Number of words up to and including the name of a subcommand. Without its subcommands, clap takes the first
-/// word that is no option for the name of an external program, and all words behind it for its arguments.
+/// Number of words up to and including the name of a subcommand. The parser knows no subcommands here. Clap therefore
+/// takes the first word that is not an option for an external program, and the following words for its arguments.
 fn end_of_name(command: &Command, inherited: &[Arg], words: &[OsString]) -> Option<usize> {
     let arguments = command.get_arguments().chain(inherited).cloned();
     let outer = Command::new("outer")
@@ -203,12 +203,12 @@ fn is_on_line(arg: &Arg, set: &ArgMatches) -> bool {
     set.value_source(arg.get_id().as_str()) == Some(ValueSource::CommandLine)
 }
 
-/// Options before the name of a command, for that command, with their values.
+/// Options that stand before the name of a command but belong to it, with their values.
 fn passed_on(command: &Command, set: &ArgMatches) -> Vec<(String, OsString)> {
-    let of_program = command.get_name() == PROGRAM;
-    let given = options(command).filter(|arg| of_program && is_on_line(arg, set));
+    let is_root = command.get_name() == PROGRAM;
+    let on_line = options(command).filter(|arg| is_root && is_on_line(arg, set));
     let value = |arg: &Arg| set.get_raw(arg.get_id().as_str())?.next_back().map(OsStr::to_owned);
-    given.filter_map(|arg| Some((arg.get_long()?.to_owned(), value(arg)?))).collect()
+    on_line.filter_map(|arg| Some((arg.get_long()?.to_owned(), value(arg)?))).collect()
 }
 
 /// Name of the root command.
@@ -251,11 +251,11 @@ impl File {
             let Some(below) = below else { break };
             tables.push(below);
         }
-        let own = |table: &&Table| table.get(key).is_some_and(|value| !value.is_table());
-        tables.into_iter().rev().find(own).and_then(|table| table.get(key))
+        let has_value = |table: &&Table| table.get(key).is_some_and(|value| !value.is_table());
+        tables.into_iter().rev().find(has_value).and_then(|table| table.get(key))
     }
 
-    /// An option as it would stand on a command line; nothing if the file has no value for it.
+    /// The words of an option on a command line. Empty if the file has no value for it.
     /// Errors: a value of the wrong type.
     fn tokens(&self, names: &[&str], arg: &Arg) -> Result<Vec<OsString>> {
         let key = arg.get_long().unwrap_or_default();
@@ -276,12 +276,12 @@ impl File {
     }
 }
 
-/// Refuses keys that no command below `command` has. `place` is the heading of the table.
-fn check(table: &Table, command: &Command, place: &str) -> Result<(), String> {
+/// Refuses keys that no command below `command` has. `heading` is the name of the table.
+fn check(table: &Table, command: &Command, heading: &str) -> Result<(), String> {
     for (key, value) in table {
-        if let (Some(below), Some(own)) = (command.find_subcommand(key), value.as_table()) {
-            let place = if place.is_empty() { key.clone() } else { format!("{place}.{key}") };
-            check(own, below, &place)?;
+        if let (Some(below), Some(inner)) = (command.find_subcommand(key), value.as_table()) {
+            let heading = if heading.is_empty() { key.clone() } else { format!("{heading}.{key}") };
+            check(inner, below, &heading)?;
             continue;
         }
         let keys = keys(command);
@@ -290,9 +290,11 @@ fn check(table: &Table, command: &Command, place: &str) -> Result<(), String> {
             return Err(format!("there is no command {key:?}{}", nearest(key, names)));
         }
         if !keys.contains(&key.as_str()) {
-            let who = if place.is_empty() { "no command" } else { place };
-            let has = if place.is_empty() { "has an option" } else { "has no option" };
-            return Err(format!("{who} {has} {key:?}{}", nearest(key, keys.into_iter())));
+            let subject = match heading {
+                "" => "no command has an".to_owned(),
+                heading => format!("{heading} has no"),
+            };
+            return Err(format!("{subject} option {key:?}{}", nearest(key, keys.into_iter())));
         }
     }
     Ok(())
@@ -300,11 +302,11 @@ fn check(table: &Table, command: &Command, place: &str) -> Result<(), String> {
 
 /// Long names of the options of a command and of those below it.
 fn keys(command: &Command) -> Vec<&str> {
-    let own = options(command).filter_map(Arg::get_long);
-    own.chain(command.get_subcommands().flat_map(keys)).collect()
+    let direct = options(command).filter_map(Arg::get_long);
+    direct.chain(command.get_subcommands().flat_map(keys)).collect()
 }
 
-/// A suggestion for a name that is not valid.
+/// A suggestion for an invalid name.
 fn nearest<'a>(name: &str, valid: impl Iterator<Item = &'a str>) -> String {
     let scored = valid.map(|valid| (strsim::jaro(name, valid), valid));
     let best = scored.max_by(|(a, _), (b, _)| a.total_cmp(b));
@@ -312,7 +314,7 @@ fn nearest<'a>(name: &str, valid: impl Iterator<Item = &'a str>) -> String {
     similar.map_or(String::new(), |(_, valid)| format!("; did you mean {valid:?}?"))
 }
 
-/// Values as they would stand on a command line; none for types that no option has.
+/// The values as text. `None` for types that no option accepts.
 fn texts(value: &Value) -> Option<Vec<String>> {
     match value {
         Value::String(text) => Some(vec![text.clone()]),
@@ -359,7 +361,7 @@ mod tests {
     /// Expands a line in which `FILE` stands for the path of a file with this text.
     fn with_file(text: &str, line: &[&str]) -> Result<Vec<String>, String> {
         let folder = tempfile::tempdir().unwrap();
-        // The name of the file is the name of a command, too.
+        // The file has the same name as a command.
         let file = folder.path().join("worker");
         fs::write(&file, text).unwrap();
         let file = file.to_str().unwrap();
@@ -375,14 +377,14 @@ mod tests {
     }
 
     #[test]
-    fn the_file_supplies_what_line_and_environment_leave_open() {
+    fn the_file_supplies_options_that_are_not_set() {
         let file = "data = \"/a\"\n[serve]\nopen = true\nhost = [\"x\", \"y\"]\nmost = 9\n";
         let serve = with(file, &["serve"]).unwrap();
         assert_eq!(serve, ["serve", "--data=/a", "--open", "--host=x", "--host=y", "--most=9"]);
         assert_eq!(with(file, &["token", "create"]).unwrap(), ["token", "--data=/a", "create"]);
         assert_eq!(with(file, &["worker"]).unwrap(), ["worker"], "worker has none of these");
         let line = ["serve", "--data", "/b", "--most=3", "--host=z", "--open"];
-        assert_eq!(with(file, &line).unwrap(), line, "the command line has the last word");
+        assert_eq!(with(file, &line).unwrap(), line, "the command line takes precedence");
         assert_eq!(with("[serve]\nopen = false", &["serve"]).unwrap(), ["serve"]);
     }
 
@@ -440,8 +442,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_in_the_file_is_named() {
-        for (text, named) in [
+    fn an_error_in_the_file_names_the_key() {
+        for (text, expected) in [
             ("dat = 1", "no command has an option \"dat\"; did you mean \"data\"?"),
             ("[serve]\nlist = 1", "serve has no option \"list\""),
             ("[serve]\nmots = 1", "serve has no option \"mots\"; did you mean \"most\"?"),
@@ -457,14 +459,17 @@ mod tests {
             ("most", "TOML"),
         ] {
             let error = with(text, &["serve"]).unwrap_err();
-            assert!(error.contains(named) && error.contains("the configuration file /"), "{error}");
+            assert!(
+                error.contains(expected) && error.contains("the configuration file /"),
+                "{error}"
+            );
         }
         let line = ["sci-recon", "--config", "/nowhere/x.toml", "serve"].map(OsString::from);
         assert!(expand(&root(), line.into()).unwrap_err().to_string().contains("/nowhere/x.toml"));
     }
 
     #[test]
-    fn a_refused_value_of_the_file_is_traced_to_it() {
+    fn an_invalid_value_is_traced_to_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("sci.toml");
         fs::write(&file, "[serve]\nmost = \"many\"").unwrap();
@@ -478,7 +483,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_says_where_each_value_comes_from() {
+    fn the_table_shows_the_origin_of_each_value() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("sci.toml");
         fs::write(&file, "data = \"/a\"\nlab = \"l\"").unwrap();
@@ -489,8 +494,8 @@ mod tests {
         };
         let text = shown(&["serve"], &["--open", "--host", "a", "--host=b"]);
         let line = |key: &str| {
-            let found = text.lines().find(|line| line.starts_with(key)).unwrap();
-            found.split_whitespace().map(str::to_owned).collect::<Vec<_>>()
+            let row = text.lines().find(|line| line.starts_with(key)).unwrap();
+            row.split_whitespace().map(str::to_owned).collect::<Vec<_>>()
         };
         assert_eq!(line("data"), ["data", "/a", file.to_str().unwrap()]);
         assert_eq!(line("open"), ["open", "true", "the", "command", "line"]);

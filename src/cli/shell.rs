@@ -1,4 +1,4 @@
-//! What shells and man want: `sci-recon completions` and `sci-recon man`.
+//! `sci-recon completions` and `sci-recon man`: print shell completions, and write man pages.
 
 use std::path::PathBuf;
 
@@ -19,13 +19,13 @@ pub struct Completions {
 /// Write man pages for the program and its commands.
 #[derive(Debug, Args)]
 pub struct Man {
-    /// Folder for the pages; it must be there.
+    /// Folder for the pages; it must exist.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
 
 pub fn completions(arguments: &Completions, mut root: Command) -> Result<()> {
-    // The generator panics where it can't write, so it writes to memory.
+    // The generator panics if it can't write, so it writes to memory.
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut root, "sci-recon", &mut script);
     print_text(String::from_utf8_lossy(&script))

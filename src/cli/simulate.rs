@@ -1,4 +1,4 @@
-//! `sci-recon simulate`: masks and a measurement of a known scene.
+//! `sci-recon simulate`: simulates masks and a measurement of a known scene.
 
 mod captures;
 
@@ -24,8 +24,8 @@ pub struct Arguments {
     /// The scene: npy, npz, multi-page TIFF, a .mat scene's `orig`, or a folder of PNGs.
     #[arg(long, value_name = "FILE")]
     frames: PathBuf,
-    /// A sensor with these colours of its pixels, row by row of a cell of 2x2: the scene has colours then, as
-    /// npy [frame, row, column, 3] or a folder of colour PNGs [default: a grey sensor].
+    /// The colours of the sensor's pixels, row by row of a 2x2 cell. The scene must then have colours: npy [frame, row,
+    /// column, 3] or a folder of colour PNGs [default: a grey sensor].
     #[arg(long, value_name = "NAME", value_parser = mosaic())]
     mosaic: Option<Mosaic>,
     /// Value in the frames' file that means 1 [default: 255 for uint8 and .mat scenes, 65535 for
@@ -35,7 +35,7 @@ pub struct Arguments {
     /// Frames in one snapshot.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     compression_ratio: u16,
-    /// Snapshots to be made, each of the next N frames of the scene.
+    /// Number of snapshots, each from the next frames of the scene.
     #[arg(long, value_name = "N", default_value_t = 1,
           value_parser = clap::value_parser!(u16).range(1..))]
     snapshots: u16,
@@ -44,8 +44,8 @@ pub struct Arguments {
     /// Seed of the random numbers.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Also write the raw captures that a lab would take, with this number of repeats of each, as
-    /// 16-bit numbers into the folder captures; captures.json there lists them.
+    /// Also write the raw captures that a lab would take, with this number of repeats of each, as 16-bit numbers to the
+    /// folder captures; captures.json there lists them.
     #[arg(long, value_name = "REPEATS", value_parser = clap::value_parser!(u16).range(1..=1000))]
     captures: Option<u16>,
     /// Noise of the measurement on the scale of 255 grey values: S/255 is the standard deviation
@@ -57,7 +57,7 @@ pub struct Arguments {
     out: PathBuf,
 }
 
-/// `simulation.json`.
+/// The content of `simulation.json`.
 #[derive(Debug, Serialize)]
 struct Record {
     program_version: &'static str,
@@ -66,22 +66,22 @@ struct Record {
     blur: f64,
     leak: f32,
     seed: u64,
-    /// None for a grey sensor.
+    /// `None` for a grey sensor.
     mosaic: Option<Mosaic>,
     compression_ratio: usize,
     snapshots: usize,
     height: usize,
     width: usize,
-    /// Frames of the scene that were left over.
+    /// Number of unused frames at the end of the scene.
     unused_frames: usize,
-    /// Standard deviation that was added to the measurement, on its own scale.
+    /// Standard deviation of the noise on the measurement's scale.
     noise_sigma: f32,
     mask_mean: f32,
     /// Share of the light of the whole open aperture, without a mask, that the masks pass.
     light_throughput: f64,
     /// That share where a mask is 1.
     mask_scale: f32,
-    /// Value of the first measurement of `captures` that means 1; none without captures.
+    /// Value of the measurement in `captures` that means 1. `None` without captures.
     capture_full_scale: Option<f32>,
     optics: OpticsFile,
     apertures: Option<Apertures>,
@@ -108,33 +108,33 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     if count < used {
         return Err(CliError::Input(format!(
-            "{} holds {count} frames, but {} snapshots of {ratio} frames need {used}",
+            "{} has {count} frames, but {} snapshots of {ratio} frames need {used}",
             arguments.frames.display(),
             arguments.snapshots
         )));
     }
     let optics = arguments.masks.optics()?;
     let light = illumination((height, width), optics.vignetting())?;
-    // The illumination stays part of the scene: this is what can be seen of it.
+    // The illumination is part of the scene, because a reconstruction can't separate them.
     let mut truth = frames.slice(s![..used, .., ..]).to_owned();
     for channel in 0..channels.count() {
-        let mut of = truth.slice_mut(s![.., .., channel..;channels.count().cast_signed()]);
-        of *= &light;
+        let mut values = truth.slice_mut(s![.., .., channel..;channels.count().cast_signed()]);
+        values *= &light;
     }
-    let made = arguments.masks.make(&optics, (ratio, height, width), arguments.seed)?;
-    let SimulatedMasks { masks, throughput, scale, apertures } = made;
-    let seen = match arguments.mosaic {
+    let simulated = arguments.masks.make(&optics, (ratio, height, width), arguments.seed)?;
+    let SimulatedMasks { masks, throughput, scale, apertures } = simulated;
+    let sensor_frames = match arguments.mosaic {
         None => truth.clone(),
         Some(mosaic) => {
-            let mut seen = Array3::zeros((used, height, width));
-            for (mut seen, truth) in seen.outer_iter_mut().zip(truth.outer_iter()) {
-                seen.assign(&mosaic.sample(truth, (0, 0)));
+            let mut sampled = Array3::zeros((used, height, width));
+            for (mut frame, truth) in sampled.outer_iter_mut().zip(truth.outer_iter()) {
+                frame.assign(&mosaic.sample(truth, (0, 0)));
             }
-            seen
+            sampled
         }
     };
-    let seen = seen.view();
-    let snapshots = measure_all(&masks, seen, arguments.noise_sigma / 255.0, arguments.seed)?;
+    let scene = sensor_frames.view();
+    let snapshots = measure_all(&masks, scene, arguments.noise_sigma / 255.0, arguments.seed)?;
     let mut record = Record {
         program_version: env!("CARGO_PKG_VERSION"),
         pattern: arguments.masks.pattern(),
@@ -166,13 +166,13 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             repeats: repeats.into(),
             seed: arguments.seed,
         };
-        let full_scale = lab.write(&arguments.out.join("captures"), snapshots.len(), seen)?;
+        let full_scale = lab.write(&arguments.out.join("captures"), snapshots.len(), scene)?;
         record.capture_full_scale = Some(full_scale);
     }
     write(&arguments.out, &masks, &snapshots, (truth.view(), channels), &record)
 }
 
-/// One measurement for each `B` frames of the truth.
+/// Simulates one measurement for each `B` frames of the truth.
 fn measure_all(
     masks: &Array3<f32>,
     truth: ArrayView3<'_, f32>,
@@ -183,7 +183,7 @@ fn measure_all(
     let mut snapshots = Vec::with_capacity(clips.len());
     for (index, clip) in clips.enumerate() {
         let y = measure(masks.view(), clip)?;
-        // Each snapshot has noise of its own.
+        // Each snapshot has independent noise.
         snapshots.push(noisy(y, sigma, seed.wrapping_add(index as u64))?);
     }
     Ok(snapshots)
@@ -217,7 +217,7 @@ fn write(
     fs::write(out.join("simulation.json"), text + "\n").map_err(failed)
 }
 
-/// A scene that is not on \[0,1\] has a full scale that somebody must state.
+/// Refuses a scene with values outside \[0,1\], because its full scale is unknown.
 fn check_range(path: &Path, frames: &Array3<f32>, channels: Channels) -> Result<()> {
     let outside = |value: f32| !(-1e-6..=1.0 + 1e-6).contains(&value);
     let Some(((k, i, j), value)) = frames.indexed_iter().find(|(_, v)| outside(**v)) else {

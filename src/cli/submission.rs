@@ -11,13 +11,13 @@ use super::client::{Client, Result};
 use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
 use formats::Axes;
 
-/// How calibrations, measurements and jobs are made of files.
+/// Options of the calibration, the measurement and the job.
 #[derive(Debug, Args)]
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
     #[arg(long, value_name = "ID", required_unless_present = "masks", help_heading = CALIBRATION)]
     calibration: Option<CalibrationId>,
-    /// Masks [frame, row, column] instead of a calibration; the same file makes one calibration only.
+    /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
     /// Name of the masks in an npz, .mat or HDF5 file [default: mask].
@@ -33,7 +33,7 @@ pub(super) struct SubmissionArguments {
     /// Name of the calibration [default: none].
     #[arg(long, value_name = "TEXT", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_name: Option<String>,
-    /// The colours of the sensor's pixels, row by row of a cell of 2x2 [default: a grey sensor].
+    /// The colours of the sensor's pixels, row by row of a 2x2 cell [default: a grey sensor].
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
           help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
@@ -46,7 +46,7 @@ pub(super) struct SubmissionArguments {
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE", help_heading = MEASUREMENT)]
     dark: Vec<PathBuf>,
-    /// The stored number from which on a pixel is saturated [default: the largest of its type].
+    /// The stored number at and above which a pixel is saturated [default: the largest of its type].
     #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
     saturation: Option<u32>,
     /// The stored number in the snapshots that means 1 [default: that of their type].
@@ -72,10 +72,10 @@ pub(super) struct SubmissionArguments {
     /// The network of `learned`.
     #[arg(long, value_name = "ID", help_heading = JOB)]
     model: Option<String>,
-    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's own.
+    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's default.
     #[arg(long, value_name = "FILE", help_heading = JOB)]
     schedule: Option<PathBuf>,
-    /// Which snapshots: all, an index from 0, or FIRST-LAST with both ends in.
+    /// The snapshots: all, an index from 0, or FIRST-LAST including both ends.
     #[arg(long, value_name = "WHICH", default_value = "all", help_heading = JOB)]
     snapshots: Snapshots,
     /// Largest side of a tile in pixels [default: as the algorithm needs].
@@ -109,16 +109,16 @@ impl SubmissionArguments {
         self.masks.iter().chain(&self.dark)
     }
 
-    /// Uploads masks and dark captures, makes the calibration if need be, and returns what to request.
+    /// Uploads masks and dark captures, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
         let calibration = match (&self.calibration, &self.masks) {
             (Some(id), _) => id.to_string(),
             (None, Some(masks)) => {
-                let body = self.calibration_request(client.sent(masks).await?);
-                // One file of masks makes one calibration for all clients.
+                let body = self.calibration_request(client.upload_with_bar(masks).await?);
+                // One file of masks creates one calibration for all clients.
                 let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-                client.made("/v1/calibrations", &body, &key).await?
+                client.create_checked("/v1/calibrations", &body, &key).await?
             }
             (None, None) => {
                 let text = "give --masks FILE or --calibration ID";
@@ -134,7 +134,7 @@ impl SubmissionArguments {
     pub(super) async fn send_dark(&self, client: &Client) -> Result<Vec<Sha256>> {
         let mut sent = Vec::with_capacity(self.dark.len());
         for dark in &self.dark {
-            sent.push(client.sent(dark).await?);
+            sent.push(client.upload_with_bar(dark).await?);
         }
         Ok(sent)
     }
@@ -189,15 +189,14 @@ impl SubmissionArguments {
     }
 }
 
-fn add(to: &mut Map<String, Value>, name: &str, value: Value) {
+fn add(request: &mut Map<String, Value>, name: &str, value: Value) {
     if !value.is_null() {
-        to.insert(name.to_owned(), value);
+        request.insert(name.to_owned(), value);
     }
 }
 
 impl Recipe {
-    /// Makes a measurement and a job of uploaded data. `label` is the default label.
-    /// With the same key it is the same job.
+    /// Creates a measurement and a job from uploaded data. `label` is the default label. The same key returns the same job.
     pub(super) async fn submit(
         &self,
         client: &Client,
@@ -208,7 +207,7 @@ impl Recipe {
         let mut measurement = self.measurement.clone();
         measurement.insert("data".to_owned(), json!(data));
         let body = Value::Object(measurement);
-        let measurement = client.made("/v1/measurements", &body, key).await?;
+        let measurement = client.create_checked("/v1/measurements", &body, key).await?;
         let mut job = self.job.clone();
         job.insert("measurement".to_owned(), json!(measurement));
         if !job.contains_key("label") {
@@ -233,7 +232,7 @@ mod tests {
         SubmissionArguments::augment_args(Command::new("test"))
     }
 
-    /// Names of the properties of a request in the contract, without some.
+    /// Names of the properties of a request in the API contract, except those in `without`.
     fn properties(schema: &str, without: &[&str]) -> BTreeSet<String> {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/openapi.yaml");
         let contract: Value = serde_yaml_ng::from_str(&fs::read_to_string(path).unwrap()).unwrap();
@@ -249,7 +248,7 @@ mod tests {
         request.keys().cloned().collect()
     }
 
-    /// With all options given, each request has every property of the contract that no command derives.
+    /// With all options set, each request has every property of the API contract that the commands do not derive.
     #[test]
     fn options_cover_every_property_of_the_requests() {
         let folder = tempfile::tempdir().unwrap();
@@ -281,7 +280,7 @@ mod tests {
             ("label", "milk"),
         ];
         let mut known: BTreeSet<&str> = values.iter().map(|(name, _)| *name).collect();
-        // It stands for the masks.
+        // It replaces the options of masks.
         known.insert("calibration");
         let command = command();
         let options: BTreeSet<&str> =

@@ -1,4 +1,4 @@
-//! `sci-recon submit`: files to a service, and a job of them.
+//! `sci-recon submit`: uploads files and submits a job.
 
 use std::path::PathBuf;
 
@@ -24,7 +24,7 @@ pub struct Arguments {
     service: ServiceArguments,
     #[command(flatten)]
     submission: SubmissionArguments,
-    /// Requests with the same key make one job, however often they are sent [default: a new key].
+    /// Requests with the same key create one job, however often they are sent [default: a new key].
     #[arg(long, value_name = "TEXT")]
     key: Option<String>,
     /// Print the job as a JSON object.
@@ -36,7 +36,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
         let recipe = arguments.submission.recipe(&client).await?;
-        let data = client.sent(&arguments.measurement).await?;
+        let data = client.upload_with_bar(&arguments.measurement).await?;
         let key = arguments.key.clone().unwrap_or_else(|| Uuid::now_v7().to_string());
         let job = recipe.submit(&client, data, None, &key).await?;
         if arguments.json {

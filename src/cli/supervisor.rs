@@ -1,8 +1,7 @@
-//! Keeps worker processes running: starts them, watches their end, starts others.
+//! Keeps worker processes running: starts them, watches them, and replaces those that end.
 //!
-//! A worker's standard input is a pipe from here that nothing is written to. When it closes, be it
-//! because the server wants the worker to end or because the server was killed, the worker gives its
-//! task back and ends: no worker outlives its server.
+//! The server holds a pipe to each worker's standard input and writes nothing to it. The pipe closes when the server stops
+//! the worker or is killed. The worker then returns its task and ends, so no worker outlives its server.
 
 use std::ffi::OsStr;
 use std::os::unix::process::ExitStatusExt;
@@ -19,18 +18,18 @@ use engine::job::WorkerId;
 use engine::pipeline::usage::{kills_for_memory, peak_rss_of};
 use store::{Store, WorkerEnd};
 
-/// How long a worker may take to give its task back.
+/// Time that a worker has to return its task.
 pub(super) const GRACE: Duration = Duration::from_secs(8);
-/// The shortest and the longest pause before a worker is started again.
+/// The shortest and the longest pause before a worker is restarted.
 pub(super) const PAUSES: (Duration, Duration) =
     (Duration::from_millis(100), Duration::from_secs(15));
-/// Time between looks at a worker's memory.
-const MEMORY_LOOK: Duration = Duration::from_millis(500);
-/// Time between looks at a worker's signs of life.
-const LOOK: Duration = Duration::from_secs(5);
-/// A worker that gives no sign of life for so long hangs as a whole; its lease has run out.
-const SILENCE: Duration = Duration::from_secs(30);
-/// A worker that lived for so long did not die of its start.
+/// Time between readings of a worker's memory.
+const MEMORY_POLL: Duration = Duration::from_millis(500);
+/// Time between readings of a worker's last sign of life.
+const SIGN_POLL: Duration = Duration::from_secs(5);
+/// A worker without a sign of life for this long hangs; the lease of its task has expired.
+const MAX_SILENCE: Duration = Duration::from_secs(30);
+/// A worker that has lived this long has started correctly.
 pub(super) const HEALTHY: Duration = Duration::from_secs(20);
 
 pub(super) struct Supervisor {
@@ -38,7 +37,7 @@ pub(super) struct Supervisor {
 }
 
 impl Supervisor {
-    /// Starts a worker with each of these arguments, to end when `stop` becomes true.
+    /// Starts one worker for each element of `workers`. They end when `stop` becomes true.
     pub(super) fn start(
         store: &Store,
         program: &Path,
@@ -93,8 +92,8 @@ impl Slot {
         let arguments =
             WorkerArguments { id: Some(id), supervised: true, ..self.arguments.clone() };
         let mut command = Command::new(&self.program);
-        // The command line states every setting. A variable of the server, such as its NATS credential, would
-        // be taken for the worker's.
+        // The command line states every setting. The worker must not read variables that are for the server, such as
+        // its NATS credential.
         for (name, _) in std::env::vars_os().filter(|(name, _)| is_setting(name)) {
             command.env_remove(name);
         }
@@ -102,7 +101,7 @@ impl Slot {
             .args(arguments.command_line())
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
-            // Away from the terminal: Ctrl-C is for the server, which then tells the workers.
+            // Ctrl-C in the terminal must reach only the server, which then stops the workers.
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
@@ -127,7 +126,7 @@ impl Slot {
             None => {
                 drop(stdin);
                 end(id, child).await;
-                // However it ended, it was told to: nothing is held against its task.
+                // The server asked the worker to stop, so its end does not count against its task.
                 WorkerEnd::Left
             }
         };
@@ -149,7 +148,7 @@ impl Slot {
             WorkerEnd::Crashed(how) => tracing::error!(worker = %id, how, "a worker has died"),
         }
         if let Err(error) = self.store.worker_ended(id, end).await {
-            // Its lease runs out instead.
+            // The task is freed when its lease expires.
             tracing::error!(worker = %id, %error, "the task of a worker can't be freed");
         }
     }
@@ -160,12 +159,12 @@ fn is_setting(name: &OsStr) -> bool {
     name.as_encoded_bytes().starts_with(b"SCI_RECON_")
 }
 
-/// The memory of a worker, as far as it shows from outside.
+/// Observes the memory of a worker from outside.
 struct Memory {
     process: Option<u32>,
-    /// The most that it was seen to have, in bytes.
+    /// Largest observed resident memory in bytes.
     peak: u64,
-    /// Kills by the kernel for want of memory, among the processes of this service, before it began.
+    /// The kernel's count of out-of-memory kills among the processes of this service when the worker started.
     kills: Option<u64>,
 }
 
@@ -179,19 +178,19 @@ impl Memory {
             if let Some(process) = self.process {
                 self.peak = self.peak.max(peak_rss_of(process));
             }
-            tokio::time::sleep(MEMORY_LOOK).await;
+            tokio::time::sleep(MEMORY_POLL).await;
         }
     }
 
-    /// The same end, with what memory had to do with it.
+    /// Adds the use of memory to the cause of a worker's end.
     fn explain(&self, end: WorkerEnd, limit: Option<u64>) -> WorkerEnd {
-        let peak = format!("its memory was seen at {} MiB", self.peak >> 20);
+        let peak = format!("it used {} MiB of memory", self.peak >> 20);
         match end {
             WorkerEnd::Killed if kills_for_memory() > self.kills => {
                 WorkerEnd::Starved(format!("the machine had no memory left for it; {peak}"))
             }
             WorkerEnd::Crashed(how) => WorkerEnd::Crashed(match limit {
-                Some(limit) => format!("{how}; {peak} of the {} MiB it may take", limit >> 20),
+                Some(limit) => format!("{how}; {peak}, its limit is {} MiB", limit >> 20),
                 None => format!("{how}; {peak}"),
             }),
             end => end,
@@ -200,25 +199,25 @@ impl Memory {
 }
 
 async fn stopped(stop: &mut watch::Receiver<bool>) {
-    // An error means that the sender is gone, which is a stop as well.
+    // An error means that the sender was dropped, which is a stop as well.
     let _ = stop.wait_for(|stop| *stop).await;
 }
 
-/// Waits until a worker has given no sign of life for too long, by the clock that does not jump.
+/// Waits until a worker has given no sign of life for [`MAX_SILENCE`], by the monotonic clock.
 async fn silent(store: &Store, id: WorkerId) {
     let (mut last, mut since) = (None, Instant::now());
-    while since.elapsed() < SILENCE {
-        tokio::time::sleep(LOOK).await;
+    while since.elapsed() < MAX_SILENCE {
+        tokio::time::sleep(SIGN_POLL).await;
         match store.last_sign(id).await {
             Ok(sign) if sign == last => {}
             Ok(sign) => (last, since) = (sign, Instant::now()),
-            // Nobody can give a sign then.
+            // Workers can't record signs either while the database fails.
             Err(_) => since = Instant::now(),
         }
     }
 }
 
-/// Waits for a worker that was told to end, and kills it if it does not.
+/// Waits for a worker that was asked to stop, and kills it after [`GRACE`].
 async fn end(id: WorkerId, mut child: Child) {
     if tokio::time::timeout(GRACE, child.wait()).await.is_err() {
         tracing::warn!(worker = %id, "a worker did not end in time and is killed");
@@ -228,7 +227,7 @@ async fn end(id: WorkerId, mut child: Child) {
     }
 }
 
-/// Why a worker ended: by itself, from outside, or of a fault that its task may have caused.
+/// Classifies the end of a worker: a normal exit, a kill from outside, or a crash that its task may have caused.
 pub(super) fn judge(status: ExitStatus) -> WorkerEnd {
     const SIGINT: i32 = 2;
     const SIGKILL: i32 = 9;
@@ -245,7 +244,7 @@ mod tests {
     use super::{ExitStatus, ExitStatusExt, WorkerEnd, judge};
 
     #[test]
-    fn a_kill_is_not_held_against_the_task_and_a_fault_is() {
+    fn a_crash_counts_against_the_task_and_a_kill_does_not() {
         assert!(matches!(judge(ExitStatus::from_raw(0)), WorkerEnd::Left));
         assert!(matches!(judge(ExitStatus::from_raw(9)), WorkerEnd::Killed));
         for fault in [11, 6, 4, 101 << 8] {

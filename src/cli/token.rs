@@ -1,4 +1,4 @@
-//! `sci-recon token`: lets labs in and out.
+//! `sci-recon token`: manages the access tokens of labs.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use store::{Purpose, Store, StoreError, Token};
 
 /// Create, list and revoke access tokens.
 ///
-/// From the first token on, the service refuses requests without one.
+/// Once a token exists, the service refuses requests without one.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// Folder of the service's data; the service may be running.
@@ -26,39 +26,39 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Make a token and print it. It is stored nowhere, so it can't be printed again.
+    /// Create a token and print it. It is not stored, so it can't be printed again.
     Create(Create),
     /// List all tokens, without their secrets.
     List,
-    /// Revoke a token, at once and for ever.
+    /// Revoke a token immediately and permanently.
     Revoke {
-        /// Its identifier, as `list` shows it.
+        /// Identifier of the token, as `list` shows it.
         id: TokenId,
     },
 }
 
 #[derive(Debug, Args)]
 struct Create {
-    /// The lab whose data it opens; data from before there were tokens belong to `local`.
+    /// The lab that the token gives access to. Data that were created without a token belong to `local`.
     #[arg(long, value_name = "NAME")]
     lab: Lab,
-    /// read: look and download; submit: also upload, ask for jobs, cancel and delete; admin: also
-    /// see the figures of the whole service.
+    /// read: view and download; submit: also upload, request jobs, cancel and delete; admin: also view the metrics of
+    /// the whole service.
     #[arg(long, value_name = "ROLE", default_value = "submit")]
     role: Role,
-    /// Good for all labs: with the role admin it also sets their limits.
+    /// Give access to all labs; with the role admin, also to their limits.
     #[arg(long)]
     all_labs: bool,
-    /// When it ends: after a time, like 90d or 12h, or at a moment, like 2027-01-31T00:00:00Z [default: never].
+    /// Expiry of the token: after a time, like 90d or 12h, or at a date, like 2027-01-31T00:00:00Z [default: never].
     #[arg(long, value_name = "WHEN", value_parser = expiry)]
     expires: Option<Timestamp>,
-    /// Bytes of uploads that it may keep here [default: no limit].
+    /// Bytes that the token's uploads may occupy [default: no limit].
     #[arg(long, value_name = "BYTES", value_parser = crate::config::bytes)]
     max_bytes: Option<u64>,
-    /// Makes the data folder, if there is none yet.
+    /// Create the data folder if it does not exist.
     #[arg(long)]
     new: bool,
-    /// Whom it is for.
+    /// The person or purpose that the token is for.
     #[arg(long, value_name = "TEXT")]
     note: Option<Label>,
 }
@@ -67,7 +67,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let store = open(arguments).await?;
         let text = act(&store, &arguments.action).await?;
-        // A copy of the database from before has other tokens, or none, and is known by this.
+        // This makes earlier copies of the database, which have other tokens, recognizable.
         if !matches!(arguments.action, Action::List) {
             store.advance_generation().await?;
         }
@@ -86,7 +86,7 @@ async fn open(arguments: &Arguments) -> Result<Store> {
             Ok(Store::open(&arguments.data, Purpose::Serve { accept_database: false }).await?)
         }
         (Err(error @ StoreError::NoFolder(_)), Some(false)) => {
-            Err(CliError::Input(format!("{error}; --new makes one")))
+            Err(CliError::Input(format!("{error}; create it with --new")))
         }
         (opened, _) => Ok(opened?),
     }
@@ -122,7 +122,7 @@ async fn make(store: &Store, create: &Create) -> Result<String> {
     Ok(secret.reveal().to_owned())
 }
 
-/// A moment that lies ahead, or a number of days or hours from now.
+/// Parses a time in the future, or a number of days or hours from now.
 fn expiry(text: &str) -> Result<Timestamp, String> {
     let now = Timestamp::now();
     let seconds = |number: &str, unit: u64| {
@@ -136,8 +136,8 @@ fn expiry(text: &str) -> Result<Timestamp, String> {
     };
     moment.filter(|moment| *moment > now).ok_or_else(|| {
         format!(
-            "{text:?} is no moment ahead; give a time, like 90d or 12h, or a moment, like \
-             2027-01-31T00:00:00Z"
+            "{text:?} is not a time in the future; give a duration, like 90d or 12h, or a date, like \
+            2027-01-31T00:00:00Z"
         )
     })
 }
@@ -145,7 +145,7 @@ fn expiry(text: &str) -> Result<Timestamp, String> {
 fn table(tokens: &[(Token, u64)]) -> String {
     let mut lines = vec![format!(
         "{:36}  {:16}  {:6}  {:6}  {:>14}  {:>14}  {:24}  {:24}  {:24}  {:24}  note",
-        "id", "lab", "role", "labs", "bytes", "limit", "made", "last used", "expires", "revoked"
+        "id", "lab", "role", "labs", "bytes", "limit", "created", "last used", "expires", "revoked"
     )];
     for (token, bytes) in tokens {
         let limit = token.max_bytes.map_or_else(|| "none".into(), |limit| limit.to_string());
@@ -188,7 +188,7 @@ mod tests {
     use engine::job::Timestamp;
 
     #[test]
-    fn a_token_ends_at_a_moment_ahead() {
+    fn an_expiry_lies_in_the_future() {
         let now = Timestamp::now();
         let days = expiry("90d").unwrap().seconds_since(now) / 86_400.0;
         assert!((89.9..90.1).contains(&days), "{days}");

@@ -1,4 +1,4 @@
-//! Findings and verdicts as text, the same for all commands.
+//! Formats findings and verdicts for all commands.
 
 use std::fmt::Write;
 
@@ -7,10 +7,11 @@ use super::client::Job;
 use super::error::Result;
 use engine::job::{Assessment, Finding, JobState, Severity};
 
-/// Snapshots that a line of a finding names; further ones are counted.
+/// Snapshots after the first that the line of a finding lists. Further ones are counted.
 const NAMED_SNAPSHOTS: usize = 8;
 
-/// One line for each finding, with its remedy. Findings of several snapshots with one code share a line.
+/// Formats each finding as one line with its remedy. Findings with the same code share a line if they are about
+/// snapshots.
 pub(super) fn lines(findings: &[Finding]) -> Vec<String> {
     let mut groups: Vec<(&Finding, Vec<u32>)> = Vec::new();
     for finding in findings {
@@ -30,23 +31,23 @@ fn line(finding: &Finding, snapshots: &[u32]) -> String {
         Severity::Error => "error",
         Severity::Warning => "warning",
     };
-    let mut place = String::new();
+    let mut prefix = String::new();
     if let [first, others @ ..] = snapshots {
-        let _ = write!(place, "snapshot {first}: ");
+        let _ = write!(prefix, "snapshot {first}: ");
         if !others.is_empty() {
             let named: Vec<String> =
                 others.iter().take(NAMED_SNAPSHOTS).map(ToString::to_string).collect();
             let further = others.len().saturating_sub(NAMED_SNAPSHOTS);
             let further = if further > 0 { format!(" and {further} more") } else { String::new() };
-            place = format!("snapshots {first}, {}{further}: ", named.join(", "));
+            prefix = format!("snapshots {first}, {}{further}: ", named.join(", "));
         }
     }
     let Finding { code, detail, remedy, .. } = finding;
     let (detail, remedy) = (detail.trim_end_matches('.'), remedy.trim_end_matches('.'));
-    format!("{severity} {code}: {place}{detail}. Remedy: {remedy}.")
+    format!("{severity} {code}: {prefix}{detail}. Remedy: {remedy}.")
 }
 
-/// The grade, with the expected PSNR where it can be predicted.
+/// The grade, with the expected PSNR if it can be predicted.
 pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> String {
     match assessment {
         Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, .. }) => format!(
@@ -58,7 +59,7 @@ pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> 
     }
 }
 
-/// The findings of the checks, and the further reasons of an assessment.
+/// The findings of the checks, and those reasons of an assessment that have other codes.
 pub(super) fn merge(checks: &[Finding], assessment: Option<&Assessment>) -> Vec<Finding> {
     let mut findings = checks.to_vec();
     for reason in assessment.iter().flat_map(|assessment| &assessment.reasons) {
@@ -73,7 +74,7 @@ fn errors(findings: &[Finding]) -> usize {
     findings.iter().filter(|finding| finding.severity == Severity::Error).count()
 }
 
-/// Ends a command that is done with exit code 3 if the checks found errors.
+/// Returns the error for exit code 3 if the checks found errors.
 pub(super) fn refuse_errors<'a>(findings: impl IntoIterator<Item = &'a [Finding]>) -> Result<()> {
     let count: usize = findings.into_iter().map(errors).sum();
     match count {
@@ -90,7 +91,7 @@ impl Job {
         merge(&self.warnings, self.assessment.as_ref())
     }
 
-    /// None unless the job has succeeded.
+    /// The verdict of a job that has succeeded.
     pub(super) fn verdict(&self) -> Option<String> {
         let verdict = || verdict(self.assessment.as_ref(), &self.findings());
         (self.state == JobState::Succeeded).then(verdict)

@@ -1,4 +1,4 @@
-//! `sci-recon verify`: compares the records of a data folder, or of a copy, with the disk.
+//! `sci-recon verify`: compares the records of a data folder or a backup with its files.
 
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ pub struct Arguments {
     data: PathBuf,
 }
 
-/// Looks, and prints what was found as one JSON line.
+/// Verifies the folder, and prints the result as one JSON line.
 pub fn run(arguments: &Arguments) -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
@@ -30,12 +30,12 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         store.close().await;
         Ok::<_, CliError>(audit)
     })?;
-    let good = audit.is_good();
+    let is_good = audit.is_good();
     let Audit { files, bytes, database, damaged, missing, unknown } = audit;
-    let found = serde_json::json!({
+    let result = serde_json::json!({
         "files": files, "bytes": bytes, "database": database, "damaged": damaged,
         "missing": missing, "unknown": unknown,
     });
-    print_line(found)?;
-    if good { Ok(()) } else { Err(CliError::Failure("the data are damaged".into())) }
+    print_line(result)?;
+    if is_good { Ok(()) } else { Err(CliError::Failure("the data are damaged".into())) }
 }

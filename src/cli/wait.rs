@@ -1,4 +1,4 @@
-//! Commands that wait for asynchronous work, without a pool of threads.
+//! Runs asynchronous work of commands on one thread.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ pub fn wait<T, E: Into<CliError>>(work: impl Future<Output = Result<T, E>>) -> R
     runtime.block_on(work).map_err(Into::into)
 }
 
-/// Prints what `act` answers of the store in `data`.
+/// Opens the store in `data`, and prints the text that `act` returns.
 pub fn print_of_store(
     data: &Path,
     act: impl AsyncFnOnce(&Store) -> Result<String, CliError>,

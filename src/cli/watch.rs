@@ -28,37 +28,37 @@ pub struct Arguments {
     json: bool,
 }
 
-/// Seconds between looks at a bar.
-const LOOK: u32 = 1;
-/// Seconds that the service waits for the end of a job.
-const LONG: u32 = 20;
+/// Seconds that a request waits for the end of a job while a bar is shown.
+const WAIT_WITH_BAR: u32 = 1;
+/// Seconds that a request waits for the end of a job otherwise.
+const WAIT: u32 = 20;
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
         let screen = MultiProgress::with_draw_target(progress::target());
-        let look = if screen.is_hidden() { LONG } else { LOOK };
+        let wait = if screen.is_hidden() { WAIT } else { WAIT_WITH_BAR };
         let bars: Vec<_> = arguments
             .jobs
             .iter()
             .map(|id| (id.to_string(), screen.add(progress::bar(id.to_string()))))
             .collect();
-        // One waits at the service for each job; all of them at once.
+        // Waits for all jobs concurrently.
         let ends = bars.iter().map(|(id, bar)| async {
             loop {
-                let asked = std::time::Instant::now();
-                let job = client.job(id, look).await?;
+                let requested = std::time::Instant::now();
+                let job = client.job(id, wait).await?;
                 progress::show(bar, job.progress.percent / 100.0);
                 if job.state.is_final() {
                     return Ok::<Job, CliError>(job);
                 }
-                // Where too many of a lab wait, the answer comes at once.
-                let pause = std::time::Duration::from_secs(1).saturating_sub(asked.elapsed());
+                // The service answers at once if too many requests of the lab wait.
+                let pause = std::time::Duration::from_secs(1).saturating_sub(requested.elapsed());
                 tokio::time::sleep(pause).await;
             }
         });
         let jobs = futures_util::future::try_join_all(ends).await;
-        // The bars are for looking at: that they can't be cleared is no failure.
+        // The result does not depend on the bars. A failure to clear them is ignored.
         let _ = screen.clear();
         report(&jobs?, arguments.json)
     })

@@ -1,4 +1,4 @@
-//! `sci-recon worker`: does the tasks of a data folder, or tiles of a server elsewhere.
+//! `sci-recon worker`: performs tasks of a data folder, or tiles of a server on another machine.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -23,20 +23,20 @@ use store::{Purpose, Store, StoreError};
 use workers::nats::{ClusterError, Program, Remote, RemoteSettings};
 use workers::{Local, ModelCommand, Worker, WorkerError};
 
-/// Works until SIGTERM, Ctrl-C or, if supervised, the end of the standard input.
+/// Works until SIGTERM or Ctrl-C. A supervised worker also ends when its standard input closes.
 pub fn run(settings: &WorkerArguments) -> Result<()> {
     logging::start(settings.log_format);
-    stand_back(settings.engine.nice)?;
+    lower_priority(settings.engine.nice)?;
     if let Some(bytes) = settings.memory_bytes {
         limit_memory(bytes).map_err(CliError::Failure)?;
     }
-    // What the driver of a GPU opens is its own affair.
-    let confined = !settings.engine.unconfined && settings.engine.device == "cpu";
-    if let Some(data) = settings.data_folder().filter(|_| confined) {
+    // The driver of a GPU needs files that can't be listed.
+    let is_confined = !settings.engine.unconfined && settings.engine.device == "cpu";
+    if let Some(data) = settings.data_folder().filter(|_| is_confined) {
         let library = folders_of(settings.engine.onnxruntime.as_deref());
         let readable: Vec<&Path> = library.iter().map(PathBuf::as_path).collect();
-        if let Err(why) = confine_worker(&readable, &[data]) {
-            tracing::warn!(why, "the worker is not confined");
+        if let Err(reason) = confine_worker(&readable, &[data]) {
+            tracing::warn!(reason, "the worker is not confined");
         }
     }
     let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
@@ -67,12 +67,12 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
             ended => ended.map_err(|error| failed(&error)),
         }
     });
-    // The computing thread may still be at it, or hang: not waited for.
+    // The computing thread may still run or hang, so it is not awaited.
     runtime.shutdown_background();
     ended
 }
 
-/// Why the work came to an end.
+/// Error that ended the work.
 #[derive(Debug, thiserror::Error)]
 enum WorkEnd {
     #[error(transparent)]
@@ -126,7 +126,7 @@ fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
     }
 }
 
-/// How the worker starts the process of a user's network: with its own limits.
+/// The command lines for processes of users' networks, with the limits of this worker.
 fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     let WorkerArguments { memory_bytes, engine, .. } = settings;
     let mut options = vec!["--device".into(), engine.device.clone().into()];
@@ -144,8 +144,9 @@ fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     ModelCommand { program, run, check, memory_bytes: *memory_bytes }
 }
 
-/// Lowers the priority of this process, and so of all its threads. A lower one stays: only root may raise it.
-fn stand_back(nice: i32) -> Result<()> {
+/// Lowers the priority of this process and its threads. A priority that is already lower remains, because only root may
+/// raise it.
+fn lower_priority(nice: i32) -> Result<()> {
     let failed = |error: rustix::io::Errno| {
         CliError::Failure(format!("the priority can't be lowered: {error}"))
     };
@@ -155,7 +156,7 @@ fn stand_back(nice: i32) -> Result<()> {
     rustix::process::setpriority_process(None, nice).map_err(failed)
 }
 
-/// Waits for a reason to stop, and tells it on.
+/// Cancels `stop` at a signal, or when the server ends.
 async fn listen(supervised: bool, stop: CancellationToken) {
     tokio::select! {
         () = terminated() => {}
@@ -179,7 +180,7 @@ async fn terminated() {
     }
 }
 
-/// Waits for the end of the standard input: the server that held its other end is gone.
+/// Waits until standard input ends, which means that the server has ended.
 async fn abandoned() {
     let mut sink = [0; 64];
     let mut stdin = tokio::io::stdin();

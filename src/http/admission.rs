@@ -4,8 +4,8 @@
 //! Slots for uploads are no limit of `tower`: its answer would come before the body is read, and a
 //! client that is still sending would not see it.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex as BlockingMutex, MutexGuard, PoisonError};
 
 use tokio::sync::Mutex;
 
@@ -24,24 +24,48 @@ pub(super) struct Admission {
     store: Store,
     max_upload_bytes: u64,
     min_free_bytes: u64,
-    /// Bytes reserved for uploads that are coming in.
-    reserved: Arc<AtomicU64>,
+    incoming: Incoming,
     places: Places,
     /// Held from the look at the disk until what was let in is on record: of two that want the last room one
     /// gets it.
     gate: Mutex<()>,
 }
 
-/// Bytes of the disk reserved for an upload; what is not written is given back when this is dropped.
+/// Bytes reserved for uploads that are coming in, by lab.
+#[derive(Debug, Clone, Default)]
+struct Incoming(Arc<BlockingMutex<HashMap<Lab, u64>>>);
+
+impl Incoming {
+    fn by_lab(&self) -> MutexGuard<'_, HashMap<Lab, u64>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn add(&self, lab: &Lab, bytes: u64) {
+        *self.by_lab().entry(lab.clone()).or_default() += bytes;
+    }
+
+    fn remove(&self, lab: &Lab, bytes: u64) {
+        let mut by_lab = self.by_lab();
+        if let Some(own) = by_lab.get_mut(lab) {
+            *own = own.saturating_sub(bytes);
+            if *own == 0 {
+                by_lab.remove(lab);
+            }
+        }
+    }
+}
+
+/// Bytes of the disk reserved for an upload of a lab. Dropping it releases the bytes that were not written.
 #[derive(Debug)]
 pub(super) struct Reservation {
-    reserved: Arc<AtomicU64>,
+    incoming: Incoming,
+    lab: Lab,
     left: u64,
 }
 
 impl Drop for Reservation {
     fn drop(&mut self) {
-        self.reserved.fetch_sub(self.left, Ordering::AcqRel);
+        self.incoming.remove(&self.lab, self.left);
     }
 }
 
@@ -51,7 +75,7 @@ impl Admission {
             store,
             max_upload_bytes: settings.max_upload_bytes,
             min_free_bytes: settings.min_free_bytes,
-            reserved: Arc::default(),
+            incoming: Incoming::default(),
             places: Places::new(settings.max_uploads),
             gate: Mutex::default(),
         }
@@ -66,47 +90,46 @@ impl Admission {
         })
     }
 
-    pub(super) async fn reserve(&self, length: u64) -> Result<Reservation> {
+    pub(super) async fn reserve(&self, lab: &Lab, length: u64) -> Result<Reservation> {
         let _gate = self.gate.lock().await;
-        let reserved = self.reserved.clone();
-        // First the reservation and then the look: of two that want the last room, none gets too
-        // much.
-        reserved.fetch_add(length, Ordering::AcqRel);
-        let reservation = Reservation { reserved, left: length };
-        self.check_disk(0, "the upload", length).await?;
-        Ok(reservation)
+        self.check_disk(lab, "the upload", length).await?;
+        self.incoming.add(lab, length);
+        Ok(Reservation { incoming: self.incoming.clone(), lab: lab.clone(), left: length })
     }
 
     /// Takes bytes that are about to be written from a reservation; reserves more if they were not
     /// announced.
     pub(super) async fn take(&self, reservation: &mut Reservation, bytes: u64) -> Result<()> {
         if bytes > reservation.left {
-            let mut more = self.reserve(bytes.max(STEP)).await?;
+            let mut more = self.reserve(&reservation.lab, bytes.max(STEP)).await?;
             reservation.left += std::mem::take(&mut more.left);
         }
         reservation.left -= bytes;
-        self.reserved.fetch_sub(bytes, Ordering::AcqRel);
+        self.incoming.remove(&reservation.lab, bytes);
         Ok(())
     }
 
-    /// Refuses `what` if the disk has no room for its `needed` bytes beside what is reserved for
-    /// others. They are part of what is reserved unless `extra` says that they come on top.
-    async fn check_disk(&self, extra: u64, what: &'static str, needed: u64) -> Result<()> {
-        let reserved = self.store.promised_bytes().await? + self.reserved.load(Ordering::Acquire);
-        let others = reserved.saturating_sub(needed - extra);
-        Ok(self.store.dir().check_room(what, needed, others, self.min_free_bytes)?)
+    /// Refuses `what` if the disk has no room for its `needed` bytes beside what is reserved, or if the lab would
+    /// reserve more than its share.
+    async fn check_disk(&self, lab: &Lab, what: &'static str, needed: u64) -> Result<()> {
+        let mut reservations = self.store.reservations().await?;
+        for (owner, bytes) in self.incoming.by_lab().iter() {
+            reservations.add(owner, *bytes);
+        }
+        let reserved = reservations.seen_by(lab);
+        Ok(self.store.dir().check_room(what, needed, reserved, self.min_free_bytes)?)
     }
 
     /// Has `accept` put on record what the disk has room for, and by that reserve it: a job, an upload in
     /// pieces.
     pub(super) async fn with_room<T>(
         &self,
-        what: &'static str,
-        needed: u64,
+        lab: &Lab,
+        (what, needed): (&'static str, u64),
         accept: impl Future<Output = Result<T, StoreError>>,
     ) -> Result<T> {
         let _gate = self.gate.lock().await;
-        self.check_disk(needed, what, needed).await?;
+        self.check_disk(lab, what, needed).await?;
         Ok(accept.await?)
     }
 

@@ -1,13 +1,14 @@
 //! What all handlers share.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::extract::FromRef;
 use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
+use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
 use super::rendering::Pictures;
@@ -92,6 +93,41 @@ impl App {
         // Workers that others start bring their own.
         let found = if elsewhere { Ok(()) } else { self.settings.engine.check_library() };
         found.map_err(|error| without_paths(&error.to_string()))
+    }
+}
+
+/// Workers that were silent for longer are not counted.
+pub(super) const WORKER_AGE: Duration = Duration::from_secs(15);
+
+impl App {
+    /// The problem in words if no worker takes tiles. A service that has just started has time to start its workers.
+    pub(super) async fn tiles(&self) -> Result<std::result::Result<(), String>> {
+        if self.store.live_tile_workers(WORKER_AGE).await? > 0 {
+            return Ok(Ok(()));
+        }
+        let last = self
+            .store
+            .last_tile_worker()
+            .await?
+            .map_or(self.started_at, |last| last.max(self.started_at));
+        let seconds = Timestamp::now().seconds_since(last);
+        if seconds < WORKER_AGE.as_secs_f64() {
+            return Ok(Ok(()));
+        }
+        // Coarse: an ETag should not change every second.
+        let time = match seconds {
+            ..60.0 => format!("{:.0} s", (seconds / 15.0).floor() * 15.0),
+            60.0..3600.0 => format!("{:.0} min", (seconds / 60.0).floor()),
+            _ => format!("{:.0} h", (seconds / 3600.0).floor()),
+        };
+        Ok(Err(format!("no worker has taken tiles for {time}")))
+    }
+
+    /// What keeps the service from doing some jobs: networks, the cluster, workers for tiles.
+    pub(super) async fn troubles(&self) -> Result<Vec<String>> {
+        let cluster = self.cluster.as_ref().and_then(|trouble| trouble.borrow().clone());
+        let troubles = [self.networks().err(), cluster, self.tiles().await?.err()];
+        Ok(troubles.into_iter().flatten().collect())
     }
 }
 

@@ -147,7 +147,7 @@ async fn begin(app: &App, access: &Access, headers: &HeaderMap) -> Result<(Place
     let slot = app.admission.place(&access.lab)?;
     let length = headers.typed_get::<ContentLength>().map_or(0, |length| length.0);
     app.admission.check_length(access, length).await?;
-    Ok((slot, app.admission.reserve(length).await?))
+    Ok((slot, app.admission.reserve(&access.lab, length).await?))
 }
 
 /// Lets the client come to the end of a small body, so that it gets to see the refusal.

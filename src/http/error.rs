@@ -11,7 +11,7 @@ use strum::{EnumString, IntoStaticStr, VariantArray};
 
 use engine::intake::{IntakeError, Refusal, RefusalCode};
 use engine::job::InvalidField;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 use store::StoreError;
 
 /// tus 1.0 has a status of its own for this.
@@ -199,13 +199,16 @@ impl IntoResponse for ApiError {
     }
 }
 
-fn disk_full(cause: &(dyn std::error::Error + 'static)) -> ApiError {
-    tracing::error!(error = cause, "the disk is full");
-    ApiError::new(Code::InsufficientStorage, "the disk of the service is full")
+fn disk_error(trouble: DiskTrouble, cause: &(dyn std::error::Error + 'static)) -> ApiError {
+    tracing::error!(error = cause, ?trouble, "the disk takes no files");
+    Refusal::disk_trouble(trouble).into()
 }
 
 impl From<StoreError> for ApiError {
     fn from(error: StoreError) -> Self {
+        if let Some(trouble) = error.disk_trouble() {
+            return disk_error(trouble, &error);
+        }
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
             StoreError::Unready { .. } => Code::CalibrationNotReady,
@@ -220,14 +223,13 @@ impl From<StoreError> for ApiError {
             StoreError::Quota { .. } => Code::QuotaExceeded,
             StoreError::ManyPartials(_) => Code::TooManyUploads,
             StoreError::ManyChecks(_) => Code::TooManyChecks,
-            StoreError::NoRoom { .. } => Code::InsufficientStorage,
+            StoreError::NoRoom { .. } | StoreError::NoShare { .. } => Code::InsufficientStorage,
             StoreError::Short { .. } => {
                 tracing::error!(%error, "bytes of an upload are lost");
                 Code::UploadDamaged
             }
             StoreError::Damaged { .. } => Code::FileDamaged,
             StoreError::Interrupted | StoreError::Restless(_) => Code::Unavailable,
-            full if full.is_disk_full() => return disk_full(full),
             busy if busy.is_busy() => {
                 tracing::warn!(%error, "the database is busy");
                 let detail = "the database is busy; nothing was changed: try again";

@@ -1,11 +1,10 @@
 //! `/v1/events`: says which jobs, calibrations and measurements have changed, for those who would poll otherwise.
 //!
-//! Workers are other processes, so the server looks at the database once a second, as long as
-//! somebody listens, and compares what it sees with what it saw before.
+//! Workers are other processes, so the server reads the changes that triggers note in the database: when it is
+//! written, and once a second.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::convert::Infallible;
-use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -21,10 +20,10 @@ use tokio_util::sync::CancellationToken;
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use engine::job::{CalibrationId, JobId, Lab, MeasurementId, ModelId, ThingId};
-use store::{JobMark, Made, RequestMark, Store, StoreError};
+use engine::job::{JobId, Lab, ThingId};
+use store::{Changes, Made, Store, StoreError};
 
-/// The longest time between two looks at all jobs.
+/// The longest time between two looks at the changes.
 const LOOK: Duration = Duration::from_secs(1);
 /// The shortest. Where looking takes long, a fifth of the time is spent on it at most.
 const SPACING: Duration = Duration::from_millis(40);
@@ -38,17 +37,14 @@ const WAITERS: usize = 64;
 /// What an event says that does not name all jobs.
 const MORE: &str = "\"more\":true";
 
-/// What listeners are told.
-#[derive(Debug, Serialize)]
-struct Change<Id> {
-    changed: Vec<Id>,
-    deleted: Vec<Id>,
+/// The data of an event.
+#[derive(Debug, Default, Serialize)]
+struct Change {
+    changed: Vec<String>,
+    deleted: Vec<String>,
     /// True if there are more than are named: read the list again.
     more: bool,
 }
-
-/// A mark of each thing that may change.
-type Versions<Id, Mark> = HashMap<(Lab, Id), Mark>;
 
 /// What each lab is told.
 #[derive(Debug, Default)]
@@ -72,12 +68,12 @@ fn kind(what: Made) -> Kind {
     }
 }
 
-type Changes = Arc<Told>;
+type Message = Arc<Told>;
 
 /// The stream of changes to which listeners subscribe.
 #[derive(Debug, Clone)]
 pub(super) struct Events {
-    sender: broadcast::Sender<Changes>,
+    sender: broadcast::Sender<Message>,
     places: Places,
     waiters: Waiters,
     closing: CancellationToken,
@@ -202,25 +198,9 @@ impl Drop for Waiter {
     }
 }
 
-/// What was last seen.
-struct Marks {
-    jobs: Versions<JobId, JobMark>,
-    calibrations: Versions<CalibrationId, RequestMark>,
-    measurements: Versions<MeasurementId, RequestMark>,
-    models: Versions<ModelId, RequestMark>,
-}
-
-async fn marks(store: &Store) -> Result<Marks, StoreError> {
-    Ok(Marks {
-        jobs: store.job_marks().await?,
-        calibrations: store.request_marks(Made::Calibration).await?,
-        measurements: store.request_marks(Made::Measurement).await?,
-        models: store.request_marks(Made::Model).await?,
-    })
-}
-
-async fn look(store: Store, sender: broadcast::Sender<Changes>) {
-    let mut before: Option<Marks> = None;
+async fn look(store: Store, sender: broadcast::Sender<Message>) {
+    // Number of the last change that needs no event.
+    let mut last = 0;
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
@@ -234,79 +214,70 @@ async fn look(store: Store, sender: broadcast::Sender<Changes>) {
             tokio::time::sleep(LOOK).await;
         }
         let start = Instant::now();
-        if sender.receiver_count() == 0 {
-            before = None;
-            continue;
+        match next(&store, &sender, last).await {
+            Ok(seen) => last = seen,
+            // A failing database shows in every other answer, too.
+            Err(error) => tracing::debug!(%error, "the changes can't be read"),
         }
-        // A failing database shows in every other answer, too.
-        let Ok(now) = marks(&store).await else { continue };
-        let told = match &before {
-            Some(before) => Told {
-                jobs: changes(&before.jobs, &now.jobs),
-                calibrations: changes(&before.calibrations, &now.calibrations),
-                measurements: changes(&before.measurements, &now.measurements),
-                models: changes(&before.models, &now.models),
-            },
-            // What changed between the greeting and this first look is not known.
-            None => Told {
-                jobs: everything(&now.jobs),
-                calibrations: everything(&now.calibrations),
-                measurements: everything(&now.measurements),
-                models: everything(&now.models),
-            },
-        };
-        if [&told.jobs, &told.calibrations, &told.measurements, &told.models]
-            .iter()
-            .any(|told| !told.is_empty())
-        {
-            // Fails only if the last listener has just gone.
-            let _ = sender.send(told.into());
-        }
-        before = Some(now);
         tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;
     }
 }
 
-/// What differs, for each lab for which anything does.
-fn changes<Id: Copy + Ord + Hash + Serialize, Mark: PartialEq>(
-    before: &Versions<Id, Mark>,
-    now: &Versions<Id, Mark>,
-) -> HashMap<Lab, String> {
-    let mut changes: HashMap<&Lab, Change<Id>> = HashMap::new();
-    for ((lab, id), _) in now.iter().filter(|(id, version)| before.get(id) != Some(version)) {
-        changes.entry(lab).or_default().changed.push(*id);
+/// Sends the changes after the one with the number `last`; returns the number of the last change that it has seen.
+async fn next(
+    store: &Store,
+    sender: &broadcast::Sender<Message>,
+    last: i64,
+) -> Result<i64, StoreError> {
+    // In this order: a listener that subscribes after the second line has read lists with these changes.
+    let seen = store.last_change().await?;
+    if seen == last || sender.receiver_count() == 0 {
+        return Ok(seen);
     }
-    for (lab, id) in before.keys().filter(|id| !now.contains_key(id)) {
-        changes.entry(lab).or_default().deleted.push(*id);
-    }
-    told(changes.into_iter().map(|(lab, change)| (lab, change.cut())))
+    let changes = store.changes(last).await?;
+    let seen = changes.last;
+    // Fails only if the last listener has just left.
+    let _ = sender.send(message(store, changes).await?.into());
+    Ok(seen)
 }
 
-/// Has every lab that has such things read its list again.
-fn everything<Id: Serialize, Mark>(now: &Versions<Id, Mark>) -> HashMap<Lab, String> {
-    let labs: HashSet<&Lab> = now.keys().map(|(lab, _)| lab).collect();
-    told(labs.into_iter().map(|lab| (lab, Change::<Id> { more: true, ..Change::default() })))
-}
-
-fn told<'a, Id: Serialize>(
-    changes: impl Iterator<Item = (&'a Lab, Change<Id>)>,
-) -> HashMap<Lab, String> {
-    let text = |(lab, change): (&Lab, Change<Id>)| {
-        Some((lab.clone(), serde_json::to_string(&change).ok()?))
+/// The events of all labs.
+async fn message(store: &Store, changes: Changes) -> Result<Told, StoreError> {
+    let mut by_kind: [HashMap<Lab, Change>; 4] = Default::default();
+    let Some(items) = changes.items else {
+        for lab in store.lab_names().await? {
+            for labs in &mut by_kind {
+                labs.entry(lab.clone()).or_default().more = true;
+            }
+        }
+        return Ok(texts(by_kind));
     };
-    changes.filter_map(text).collect()
-}
-
-impl<Id> Default for Change<Id> {
-    fn default() -> Self {
-        Self { changed: Vec::new(), deleted: Vec::new(), more: false }
+    for item in items {
+        let kind = match item.what.as_str() {
+            "job" => 0,
+            "calibration" => 1,
+            "measurement" => 2,
+            _ => 3,
+        };
+        let change = by_kind[kind].entry(item.lab).or_default();
+        if item.exists { &mut change.changed } else { &mut change.deleted }.push(item.id);
     }
+    Ok(texts(by_kind))
 }
 
-impl<Id: Ord> Change<Id> {
+fn texts(by_kind: [HashMap<Lab, Change>; 4]) -> Told {
+    let [jobs, calibrations, measurements, models] = by_kind.map(|labs| {
+        let text =
+            |(lab, change): (Lab, Change)| Some((lab, serde_json::to_string(&change.cut()).ok()?));
+        labs.into_iter().filter_map(text).collect()
+    });
+    Told { jobs, calibrations, measurements, models }
+}
+
+impl Change {
     /// Newest first, and no more than are named.
     fn cut(mut self) -> Self {
-        self.more = self.changed.len() > NAMED || self.deleted.len() > NAMED;
+        self.more |= self.changed.len() > NAMED || self.deleted.len() > NAMED;
         for list in [&mut self.changed, &mut self.deleted] {
             list.sort_unstable_by(|a, b| b.cmp(a));
             list.truncate(NAMED);
@@ -335,7 +306,7 @@ pub(super) async fn listen(State(events): State<Events>, access: Access) -> Resu
 
 struct Listener {
     lab: Lab,
-    receiver: broadcast::Receiver<Changes>,
+    receiver: broadcast::Receiver<Message>,
     closing: CancellationToken,
     /// What it is told next.
     waiting: VecDeque<Event>,

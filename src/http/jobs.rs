@@ -16,9 +16,9 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Limit, PageBody, ShowQuery};
 use engine::job::{
-    Algorithm, Assessment, CalibrationId, Finding, InvalidField, JobId, JobRequest, JobSpec,
-    JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule, Sequence,
-    SnapshotRange, TileSpec, Timestamp, priority_error,
+    Algorithm, Assessment, CalibrationId, Finding, FindingCode, InvalidField, JobId, JobRequest,
+    JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule,
+    Sequence, SnapshotRange, TileSpec, Timestamp, priority_error,
 };
 use store::{
     Estimate, Inserted, Job, JobChanges, JobFilter, JobProgress, Made, NewJob, Page, RequestKey,
@@ -185,7 +185,7 @@ async fn insert(
     let lab = access.lab.clone();
     let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
     let new = NewJob { most_jobs, lab, spec, key };
-    app.admission.with_room("the job", needed, app.store.add_job(new)).await
+    app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new)).await
 }
 
 /// Checks a request against the measurement that it names.
@@ -272,7 +272,27 @@ fn check_networks(app: &App, spec: &JobSpec) -> Result<()> {
 async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody> {
     let job = app.store.job(lab, id).await?;
     let progress = app.store.progress(&job).await?;
-    Ok(JobBody::new(job, progress))
+    let mut bodies = [JobBody::new(job, progress)];
+    warn_of_tiles(app, &mut bodies).await?;
+    let [body] = bodies;
+    Ok(body)
+}
+
+/// Adds a finding to jobs whose tiles no worker takes.
+async fn warn_of_tiles(app: &App, jobs: &mut [JobBody]) -> Result<()> {
+    let waits = |job: &&mut JobBody| {
+        matches!(job.state, JobState::Queued | JobState::Running)
+            && job.progress.tiles_done < job.progress.tiles_total
+    };
+    let mut waiting = jobs.iter_mut().filter(waits).peekable();
+    if waiting.peek().is_none() {
+        return Ok(());
+    }
+    if let Err(detail) = app.tiles().await? {
+        let finding = Finding::new(FindingCode::NoTileWorkers, detail);
+        waiting.for_each(|job| job.warnings.push(finding.clone()));
+    }
+    Ok(())
 }
 
 /// `GET /v1/jobs`, of one lab or of all of them, with an ETag, so that watching costs little.
@@ -293,7 +313,8 @@ pub(super) async fn list(
     let page = app.store.jobs(access.shown(), &filter, query.limit.get()).await?;
     let progress = app.store.progress_of(&page.items).await?;
     let items = page.items.into_iter().zip(progress).map(|(job, at)| JobBody::new(job, at));
-    let page = Page { items: items.collect(), more: page.more };
+    let mut page = Page { items: items.collect::<Vec<_>>(), more: page.more };
+    warn_of_tiles(&app, &mut page.items).await?;
     conditional::json(
         &PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item),
         &headers,

@@ -1,5 +1,7 @@
 //! `/v1/labs`: all labs with what they have and may have, for those who look after them.
 
+use std::collections::HashMap;
+
 use axum::Json;
 use serde::{Deserialize, Serialize};
 
@@ -21,9 +23,9 @@ pub(super) struct LabBody {
 
 #[derive(Debug, Serialize)]
 struct LimitsBody {
-    /// What it may keep here; none: no limit.
+    /// Bytes that it may keep; none: the default of the service.
     bytes: Option<u64>,
-    /// Jobs that may wait and run; none: no limit of its own.
+    /// Jobs that may wait and run; none: the default of the service.
     jobs: Option<u64>,
 }
 
@@ -42,7 +44,7 @@ pub(super) struct ListBody {
     items: Vec<LabBody>,
 }
 
-/// What a lab is to be entitled to: what is left out stays, null takes a limit away.
+/// New share and limits of a lab: missing fields stay, null sets the default of the service.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Changes {
@@ -54,9 +56,9 @@ pub(super) struct Changes {
 }
 
 pub(super) async fn list(Caller(app, _): Caller) -> Result<Json<ListBody>> {
-    let mut items = Vec::new();
+    let (mut items, costs) = (Vec::new(), app.store.cost_left_by_lab().await?);
     for row in app.store.labs().await? {
-        items.push(body(&app, row).await?);
+        items.push(body(&app, row, &costs).await?);
     }
     Ok(Json(ListBody { items }))
 }
@@ -66,7 +68,7 @@ pub(super) async fn show(
     Params(lab): Params<String>,
 ) -> Result<Json<LabBody>> {
     let row = app.store.lab(&lab).await?;
-    Ok(Json(body(&app, row).await?))
+    Ok(Json(body(&app, row, &app.store.cost_left_by_lab().await?).await?))
 }
 
 /// `PATCH /v1/labs/{lab}`.
@@ -89,13 +91,14 @@ pub(super) async fn change(
     }
     app.store.entitle(&lab, Entitlement { share, max_bytes: bytes, max_jobs: jobs }).await?;
     let row = app.store.lab(lab.as_str()).await?;
-    Ok(Json(body(&app, row).await?))
+    Ok(Json(body(&app, row, &app.store.cost_left_by_lab().await?).await?))
 }
 
-async fn body(app: &App, row: LabRow) -> Result<LabBody> {
+async fn body(app: &App, row: LabRow, costs: &HashMap<Lab, f64>) -> Result<LabBody> {
     let bytes = app.store.lab_bytes(&row.lab).await?;
     let of = app.store.lab_use(&row.lab).await?;
     let limits = LimitsBody { bytes: row.max_bytes, jobs: row.max_jobs };
-    let taken = TakenBody { bytes, of, cpu_seconds_left: row.cost_left };
+    let cpu_seconds_left = costs.get(&row.lab).copied().unwrap_or_default();
+    let taken = TakenBody { bytes, of, cpu_seconds_left };
     Ok(LabBody { lab: row.lab, share: row.share, limits, taken })
 }

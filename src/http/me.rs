@@ -31,7 +31,7 @@ struct LimitsBody {
     token_bytes: Option<u64>,
     /// That the lab may keep; none: no limit.
     lab_bytes: Option<u64>,
-    /// Jobs of the lab that may wait and run; none: no limit of its own.
+    /// Jobs of the lab that may wait and run; none: no limit for this lab.
     lab_jobs: Option<u64>,
     /// Memory of a worker: jobs that need more are refused.
     worker_memory_bytes: u64,
@@ -51,7 +51,7 @@ pub(super) async fn show(Caller(app, access): Caller) -> Result<Json<MeBody>> {
         None => None,
     };
     let lab = app.store.lab_use(&access.lab).await?;
-    let entitled = app.store.entitlement(&access.lab).await?;
+    let (lab_bytes, lab_jobs) = app.store.limits(&access.lab).await?;
     Ok(Json(MeBody {
         lab: access.lab,
         role: access.role,
@@ -61,8 +61,8 @@ pub(super) async fn show(Caller(app, access): Caller) -> Result<Json<MeBody>> {
         limits: LimitsBody {
             upload_bytes: app.settings.max_upload_bytes,
             token_bytes: access.max_bytes,
-            lab_bytes: entitled.max_bytes.flatten(),
-            lab_jobs: entitled.max_jobs.flatten(),
+            lab_bytes,
+            lab_jobs,
             worker_memory_bytes: app.settings.worker_memory_bytes,
         },
         taken: UseBody { token_bytes, lab },

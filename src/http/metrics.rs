@@ -57,6 +57,10 @@ fn describe() {
         "Bytes promised to jobs and uploads."
     );
     describe_gauge!("sci_recon_workers", "Worker processes alive.");
+    describe_gauge!(
+        "sci_recon_tile_workers",
+        "Workers alive that take tiles, here and on other machines."
+    );
     describe_gauge!("sci_recon_blobs", "Files in the content-addressed store.");
     describe_gauge!("sci_recon_blob_bytes", Unit::Bytes, "Bytes of files in that store.");
     describe_gauge!("sci_recon_damaged_files", "Stored files known to be damaged or missing.");

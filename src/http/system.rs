@@ -11,7 +11,7 @@ use axum::response::{IntoResponse, Response};
 use metrics::{counter, gauge};
 use serde::Serialize;
 
-use super::app::App;
+use super::app::{App, WORKER_AGE};
 use super::error::Result;
 use super::extract::Caller;
 use super::metrics::Figures;
@@ -19,9 +19,6 @@ use crate::config::VERSION;
 use engine::job::{JobState, TaskState, Timestamp};
 use store::{StoreError, WorkerRow};
 use strum::VariantArray;
-
-/// Workers that were silent for longer are not counted.
-const WORKER_AGE: Duration = Duration::from_secs(15);
 
 /// Time between two tries whether files can be written.
 const DISK_LOOK: Duration = Duration::from_secs(2);
@@ -39,6 +36,8 @@ pub(super) struct SystemBody {
     onnxruntime: Option<String>,
     workers_wanted: usize,
     workers: Vec<WorkerRow>,
+    /// What keeps the service from doing some jobs; empty if it does all.
+    degraded: Vec<String>,
     jobs: BTreeMap<&'static str, u64>,
     /// Tasks that can be taken up, wait for others, and are in work.
     queue: QueueBody,
@@ -80,6 +79,7 @@ pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>> {
         onnxruntime: app.store.last_onnxruntime().await?,
         workers_wanted: settings.worker_count(),
         workers: app.store.live_workers(WORKER_AGE).await?,
+        degraded: app.troubles().await?,
         jobs: jobs(&app).await?,
         queue: queue(&app).await?,
         disk: disk(&app).await?,
@@ -125,6 +125,8 @@ struct Readiness {
     database: String,
     disk: String,
     workers: String,
+    /// The problem if no worker takes tiles.
+    tiles: String,
     /// Only with `serve --nats`.
     #[serde(skip_serializing_if = "Option::is_none")]
     cluster: Option<String>,
@@ -151,12 +153,24 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
         checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
     let status = if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     let networks = app.networks();
-    let degraded = networks.is_err() || matches!(cluster, Some(Some(_)));
+    let tiles =
+        app.tiles().await.unwrap_or_else(|_| Err("the database does not answer".to_owned()));
+    let degraded = networks.is_err() || tiles.is_err() || matches!(cluster, Some(Some(_)));
+    let tiles = tiles.err().unwrap_or_else(|| "ok".to_owned());
     let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
     let cluster = cluster.map(|trouble| trouble.unwrap_or_else(|| "ok".to_owned()));
     let confinement = app.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
-    let body =
-        Readiness { ready, degraded, database, disk, workers, cluster, networks, confinement };
+    let body = Readiness {
+        ready,
+        degraded,
+        database,
+        disk,
+        workers,
+        tiles,
+        cluster,
+        networks,
+        confinement,
+    };
     (status, Json(body)).into_response()
 }
 
@@ -211,9 +225,11 @@ pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
             counter!("sci_recon_denoiser_passes_total").absolute(done.passes);
         }
     }
-    gauge!("sci_recon_disk_promised_bytes").set(app.store.promised_bytes().await? as f64);
+    gauge!("sci_recon_disk_promised_bytes").set(app.store.reservations().await?.total() as f64);
     let workers = app.store.live_workers(WORKER_AGE).await?.len();
     gauge!("sci_recon_workers").set(workers as f64);
+    let for_tiles = app.store.live_tile_workers(WORKER_AGE).await?;
+    gauge!("sci_recon_tile_workers").set(for_tiles as f64);
     let (files, bytes) = app.store.blob_totals().await?;
     gauge!("sci_recon_blobs").set(files as f64);
     gauge!("sci_recon_blob_bytes").set(bytes as f64);

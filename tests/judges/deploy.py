@@ -1,7 +1,7 @@
 """Validates the samples under deploy/ and docker/ with the programs that read them.
 
-Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Says what was not checked because its program is
-not here; ends with 1 and the reasons if anything is wrong.
+Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Lists checks that were skipped because a program is
+not installed. Ends with 1 and the reasons if a sample is invalid.
 """
 
 import contextlib
@@ -26,9 +26,9 @@ from docker.utils.build import exclude_paths
 from image import services
 
 VERSION = "1.31"
-# Tenths of the exposure that `systemd-analyze security` finds, at most.
+# Largest exposure that `systemd-analyze security` may report, in tenths.
 EXPOSURE = 30
-# An image name that no sample has: kustomize must put it everywhere.
+# An image name that no sample has. Kustomize must insert it everywhere.
 IMAGE = {"newName": "registry.example/sci-recon", "newTag": "1.2.3"}
 
 
@@ -48,7 +48,7 @@ def kubernetes(root, wrong):
         wrong.append(f"kustomization.yaml lists {listed}")
     for name, document in documents:
         if document["kind"] == "ScaledJob":
-            # A ScaledJob of KEDA: the template of its jobs is checked against the schema of a job.
+            # The job template of a KEDA ScaledJob is checked against the schema of a job.
             target = dict(document["spec"]["jobTargetRef"])
             document = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": "worker"}, "spec": target}
         try:
@@ -58,7 +58,7 @@ def kubernetes(root, wrong):
 
 
 def make_keys(program, folder, *nodes):
-    """What docs/CLUSTER.md has its readers write into `cluster` below a folder."""
+    """Writes the files that docs/CLUSTER.md creates to `cluster` below a folder."""
     options = [word for node in nodes for word in ("--node", node)]
     for line in [
         ["init", "--no-tls", *options, "--store", "/data", "--nats-version", "2.12"],
@@ -78,14 +78,14 @@ def kustomize(root, wrong, program):
         text = yaml.safe_load(file.read_text())
         text["images"] = [{**image, **IMAGE} for image in text["images"]]
         file.write_text(yaml.safe_dump(text))
-        status, said = run("kubectl", "kustomize", str(folder))
+        status, output = run("kubectl", "kustomize", str(folder))
     if status:
-        wrong.append(f"kubectl kustomize: {said}")
+        wrong.append(f"kubectl kustomize: {output}")
         return None
-    documents = list(yaml.safe_load_all(said))
+    documents = list(yaml.safe_load_all(output))
     kinds = [each["kind"] for each in documents]
     if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
-        wrong.append(f"kubectl kustomize makes {kinds}")
+        wrong.append(f"kubectl kustomize creates {kinds}")
     wrong += [f"kubectl kustomize: {reason}" for reason in unresolved(documents)]
     for name, _, template in templates(documents):
         wrong += [f"kubectl kustomize: {name}: {reason}" for reason in unrestricted(template["spec"])]
@@ -98,7 +98,7 @@ VOLUMES = {"configMap", "csi", "downwardAPI", "emptyDir", "ephemeral", "persiste
 
 
 def unrestricted(pod):
-    """Where a pod does not keep to "restricted", of which "baseline" is a part."""
+    """Violations of the standard "restricted", which includes "baseline"."""
     for name in ("hostNetwork", "hostPID", "hostIPC"):
         if pod.get(name):
             yield name
@@ -106,29 +106,29 @@ def unrestricted(pod):
         kinds = set(volume) - {"name"}
         if not kinds <= VOLUMES:
             yield f"a volume of the kind {kinds - VOLUMES}"
-    whole = pod.get("securityContext", {})
-    if whole.get("sysctls") or whole.get("seLinuxOptions"):
+    pod_context = pod.get("securityContext", {})
+    if pod_context.get("sysctls") or pod_context.get("seLinuxOptions"):
         yield "sysctls or seLinuxOptions"
     for container in [*pod.get("initContainers", []), *pod["containers"]]:
-        own = container.get("securityContext", {})
-        both = {**whole, **own}
+        container_context = container.get("securityContext", {})
+        effective = {**pod_context, **container_context}
         rules = {
-            "privileged": not own.get("privileged"),
-            "procMount": own.get("procMount", "Default") == "Default",
+            "privileged": not container_context.get("privileged"),
+            "procMount": container_context.get("procMount", "Default") == "Default",
             "hostPort": not any("hostPort" in port for port in container.get("ports", [])),
-            "allowPrivilegeEscalation": own.get("allowPrivilegeEscalation") is False,
-            "capabilities.drop": "ALL" in own.get("capabilities", {}).get("drop", []),
-            "capabilities.add": set(own.get("capabilities", {}).get("add", [])) <= {"NET_BIND_SERVICE"},
-            "runAsNonRoot": both.get("runAsNonRoot") is True,
-            "runAsUser": both.get("runAsUser") != 0,
-            "seccompProfile": both.get("seccompProfile", {}).get("type") in ("RuntimeDefault", "Localhost"),
-            "seLinuxOptions": not own.get("seLinuxOptions"),
+            "allowPrivilegeEscalation": container_context.get("allowPrivilegeEscalation") is False,
+            "capabilities.drop": "ALL" in container_context.get("capabilities", {}).get("drop", []),
+            "capabilities.add": set(container_context.get("capabilities", {}).get("add", [])) <= {"NET_BIND_SERVICE"},
+            "runAsNonRoot": effective.get("runAsNonRoot") is True,
+            "runAsUser": effective.get("runAsUser") != 0,
+            "seccompProfile": effective.get("seccompProfile", {}).get("type") in ("RuntimeDefault", "Localhost"),
+            "seLinuxOptions": not container_context.get("seLinuxOptions"),
         }
         yield from (f"{container['name']}: {name}" for name, kept in rules.items() if not kept)
 
 
 def templates(documents):
-    """Name and template of all pods that these objects make, with the object."""
+    """Name and template of all pods that these objects create, with the object."""
     for document in documents:
         spec = document.get("spec", {})
         template = spec.get("jobTargetRef", spec).get("template")
@@ -137,7 +137,7 @@ def templates(documents):
 
 
 def unresolved(documents):
-    """References among these objects that lead nowhere."""
+    """References between these objects without a target."""
     named = {}
     for document in documents:
         named.setdefault(document["kind"], {})[document["metadata"]["name"]] = document
@@ -154,7 +154,7 @@ def unresolved(documents):
             if spec["serviceName"] not in services:
                 yield f"{name} names the service {spec['serviceName']}"
             if not spec["selector"]["matchLabels"].items() <= template["metadata"]["labels"].items():
-                yield f"{name} selects other pods than its own"
+                yield f"{name} does not select the pods of its template"
         claims = {claim["metadata"]["name"]: {} for claim in spec.get("volumeClaimTemplates", [])}
         volumes = {**claims, **{volume["name"]: volume for volume in pod.get("volumes", [])}}
         for volume in volumes.values():
@@ -191,7 +191,7 @@ def unresolved_in(container, name, spec, volumes, secrets):
     for place, volume in mounts.items():
         if volume is None:
             yield f"{name} mounts at {place} what it does not declare"
-    # The files that its command line names, with what a shell makes of them in each pod.
+    # The files in the command line, as a shell in each pod expands their names.
     for line in command_lines(container, name, spec.get("replicas", 1)):
         for word in line:
             place, _, file = word.rpartition("/")
@@ -203,7 +203,7 @@ def unresolved_in(container, name, spec, volumes, secrets):
 
 
 def command_lines(container, name, replicas):
-    """The words of a container's command; behind `sh -c` those of the program that the shell ends as."""
+    """The words of a container's command. For `sh -c`, those of the program that replaces the shell."""
     command = [*container.get("command", []), *container.get("args", [])]
     if command[:2] != ["/bin/sh", "-c"]:
         return [command]
@@ -219,7 +219,7 @@ def command_lines(container, name, replicas):
 
 
 def context(root, wrong, program):
-    """What a build of the image sees: all files of the repository, and nothing that was made in the checkout."""
+    """Checks that a build of the image gets all files of the repository, and no build products of the checkout."""
     files = subprocess.run(["git", "-C", root, "ls-files", "-z"], capture_output=True, text=True, check=True).stdout
     files = {name for name in files.split("\0") if (root / name).is_file()}
     with tempfile.TemporaryDirectory() as copy:
@@ -259,22 +259,22 @@ def compose(root, wrong):
     if not shutil.which("docker-compose"):
         return "docker-compose"
     files = ["-f", str(root / "docker/compose.yaml"), "-f", str(root / "docker/cluster.yaml")]
-    status, said = run("docker-compose", *files, "config")
+    status, output = run("docker-compose", *files, "config")
     if status:
-        wrong.append(f"docker-compose config: {said}")
+        wrong.append(f"docker-compose config: {output}")
     return None
 
 
 def image(root, wrong, program):
-    """The containers of the samples, started without Docker."""
+    """Starts the containers of the samples without Docker."""
     nats_server = shutil.which("nats-server", path=os.environ["PATH"] + ":/usr/sbin")
     namespaces = ["unshare", "--mount", "--net", "--pid", "--fork", "--kill-child", "--mount-proc"]
     if not nats_server or run(*namespaces, "true")[0]:
         return "containers (nats-server, and root with namespaces)"
     script = root / "tests/judges/image.py"
-    status, said = run(*namespaces, sys.executable, script, root, program)
+    status, output = run(*namespaces, sys.executable, script, root, program)
     if status:
-        wrong.append(f"docker/Dockerfile: {said}")
+        wrong.append(f"docker/Dockerfile: {output}")
     return None
 
 
@@ -283,28 +283,28 @@ def systemd(root, wrong):
         return "systemd-analyze"
     units = (root / "deploy/systemd").iterdir()
     for unit in sorted(unit for unit in units if unit.suffix in (".service", ".timer")):
-        # With its drop-ins.
-        _, said = run("systemd-analyze", "verify", str(unit))
+        # The unit includes its drop-ins.
+        _, output = run("systemd-analyze", "verify", str(unit))
         if unit.suffix == ".timer":
             continue
         status, exposure = run("systemd-analyze", "security", "--offline=true", f"--threshold={EXPOSURE}", str(unit))
         if status:
             wrong.append(f"{unit.name}: {exposure.splitlines()[-1]}")
-        # The program is not installed where this runs.
-        said = [line for line in said.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
-        if said:
-            wrong.append(f"{unit.name}: {said}")
+        # The program is not installed on this machine.
+        output = [line for line in output.splitlines() if "/usr/local/bin/sci-recon is not executable" not in line]
+        if output:
+            wrong.append(f"{unit.name}: {output}")
         texts = [file.read_text() for file in [unit, *unit.parent.glob(f"{unit.name}.d/*.conf")]]
         wrong += [f"{unit.name}: {reason}" for reason in unreadable("\n".join(texts))]
     return None
 
 
 def filtered(root, wrong, program):
-    """The server and a worker under the unit's system call filter: a job, with all confinement."""
+    """Runs a job with a server and a worker under the unit's system call filter, with all confinement."""
     if not shutil.which("systemd-analyze"):
         return "a service under its system call filter (systemd-analyze)"
     with tempfile.TemporaryDirectory() as folder:
-        # Where a user without rights may read and run them.
+        # An unprivileged user can read and run files in this folder.
         pathlib.Path(folder).chmod(0o777)
         copy = shutil.copy2(program, folder)
         for library in (root / "runtime").glob("*.so"):
@@ -325,7 +325,7 @@ def ask(url, body=None):
 
 
 def sample_job(url):
-    """How a short job ends."""
+    """Final state of a short job."""
     job = ask(f"{url}/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
     for _ in range(6):
         state = ask(f"{url}/v1/jobs/{job}?wait=20")["state"]
@@ -335,7 +335,7 @@ def sample_job(url):
 
 
 def unreadable(text):
-    """Credentials that a unit's user can't read, since systemd does not hand them to it."""
+    """Credentials that a unit's user can't read, because systemd does not pass them."""
     lines = [line for line in text.splitlines() if "=" in line]
     loaded = [line.removeprefix("LoadCredential=").split(":")[0] for line in lines if line.startswith("LoadCredential=")]
     for name in re.findall(r"%d/([\w.-]+)", text):
@@ -356,25 +356,25 @@ def nginx(root, wrong, program):
         run("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate,
             "-days", "1", "-subj", "/CN=bench.example")
         site = (root / "deploy/nginx/sci-recon.conf").read_text()
-        for place, ours in [("/etc/ssl/bench.example.pem", certificate), ("/etc/ssl/private/bench.example.key", key),
+        for original, replacement in [("/etc/ssl/bench.example.pem", certificate), ("/etc/ssl/private/bench.example.key", key),
                             ("listen 443 ", f"listen 127.0.0.1:{port} "), ("127.0.0.1:8080;", url.removeprefix("http://") + ";")]:
-            if place not in site:
-                wrong.append(f"deploy/nginx/sci-recon.conf does not name {place}")
-            site = site.replace(place, ours)
-        whole = pathlib.Path(folder, "nginx.conf")
-        whole.write_text(f"daemon off; pid {folder}/pid; error_log {folder}/log; events {{}} "
+            if original not in site:
+                wrong.append(f"deploy/nginx/sci-recon.conf does not contain {original}")
+            site = site.replace(original, replacement)
+        configuration = pathlib.Path(folder, "nginx.conf")
+        configuration.write_text(f"daemon off; pid {folder}/pid; error_log {folder}/log; events {{}} "
                          f"http {{ access_log off; {site} }}")
-        status, said = run(server, "-t", "-q", "-c", str(whole))
+        status, output = run(server, "-t", "-q", "-c", str(configuration))
         if status:
-            wrong.append(f"nginx -t: {said}")
+            wrong.append(f"nginx -t: {output}")
             return None
-        proxy = subprocess.Popen([server, "-c", str(whole)])
+        proxy = subprocess.Popen([server, "-c", str(configuration)])
         try:
             for path in ["/v1/jobs", "/sci/v1/jobs"]:
                 own = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", f"https://bench.example:{port}")
                 other = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", "https://other.example")
                 if own == "foreign_site" or other != "foreign_site":
-                    wrong.append(f"behind nginx at {path} a page of the service gets {own}, one of another {other}")
+                    wrong.append(f"behind nginx at {path} a page of the service gets {own}, one of another site {other}")
         finally:
             proxy.terminate()
             proxy.wait()
@@ -388,7 +388,7 @@ def free_port():
 
 @contextlib.contextmanager
 def served(program, folder, before=(), workers=0):
-    """A service without tokens that is reached as bench.example, started by a command before it; its address."""
+    """Starts a service without tokens for the name bench.example; `before` precedes its command. Yields its address."""
     line = [*before, program, "serve", "--data", f"{folder}/data", "--listen", "127.0.0.1:0", "--workers", str(workers),
             "--host", "bench.example"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
@@ -399,7 +399,7 @@ def served(program, folder, before=(), workers=0):
 
 
 def refusal(url, host, origin):
-    """The code of the problem with which a change is refused that a page of `origin` sends."""
+    """Code of the problem with which the service refuses a change from a page of `origin`."""
     request = urllib.request.Request(url, b"{}", {"Host": host, "Origin": origin, "Content-Type": "application/json"})
     context = ssl._create_unverified_context()
     start = time.monotonic()
@@ -410,7 +410,7 @@ def refusal(url, host, origin):
         except urllib.error.HTTPError as error:
             return json.load(error)["code"]
         except urllib.error.URLError:
-            # It is still starting.
+            # The service is still starting.
             if time.monotonic() - start > 10:
                 raise
             time.sleep(0.1)
@@ -420,9 +420,9 @@ def caddy(root, wrong):
     if not shutil.which("caddy"):
         return "caddy"
     file = str(root / "deploy/caddy/Caddyfile")
-    status, told = run("caddy", "adapt", "--adapter", "caddyfile", "--config", file)
+    status, output = run("caddy", "adapt", "--adapter", "caddyfile", "--config", file)
     if status:
-        wrong.append(f"caddy adapt: {told}")
+        wrong.append(f"caddy adapt: {output}")
     return None
 
 
@@ -437,12 +437,12 @@ def figures(root, wrong):
 def promtool(root, wrong):
     if not shutil.which("promtool"):
         return "promtool"
-    status, told = run("promtool", "check", "rules", str(root / "deploy/prometheus/alerts.yml"))
+    status, output = run("promtool", "check", "rules", str(root / "deploy/prometheus/alerts.yml"))
     if status:
-        wrong.append(f"promtool check rules: {told}")
-    status, said = run("promtool", "check", "config", "--syntax-only", str(root / "deploy/prometheus/prometheus.yml"))
+        wrong.append(f"promtool check rules: {output}")
+    status, output = run("promtool", "check", "config", "--syntax-only", str(root / "deploy/prometheus/prometheus.yml"))
     if status:
-        wrong.append(f"promtool check config: {said}")
+        wrong.append(f"promtool check config: {output}")
     return None
 
 
@@ -453,7 +453,7 @@ def known(root, wrong, file_name, expressions):
         described |= words(file.read_text())
     missing = {name for name in names if name.removesuffix("_bucket") not in described}
     if missing or not names:
-        wrong.append(f"{file_name} uses metrics that the service does not have: {sorted(missing)}")
+        wrong.append(f"{file_name} uses metrics that the service lacks: {sorted(missing)}")
 
 
 def words(text):

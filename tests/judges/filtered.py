@@ -39,7 +39,7 @@ def main():
     denied = pyseccomp.ERRNO(getattr(errno, dict(settings)["SystemCallErrorNumber"]))
     rules = pyseccomp.SyscallFilter(denied)
     if dict(settings).get("MemoryDenyWriteExecute") == "yes":
-        # Allowed where the memory is not both, and where it was not made executable afterwards.
+        # Allowed unless the memory is writable and executable, or becomes executable later.
         both = mmap.PROT_WRITE | mmap.PROT_EXEC
         for call, bits in [("mmap", both), ("mprotect", mmap.PROT_EXEC), ("pkey_mprotect", mmap.PROT_EXEC)]:
             allowed.discard(call)
@@ -50,7 +50,7 @@ def main():
         try:
             rules.add_rule(pyseccomp.ALLOW, call)
         except (ValueError, OSError):
-            # This processor has none of that name.
+            # This processor has no call of that name.
             pass
     if os.getuid() == 0:
         os.setgroups([])

@@ -1,11 +1,11 @@
-"""Starts what docker/ and deploy/kubernetes/ start, without Docker: a root is laid out as the last stage of
-docker/Dockerfile says, with its user, environment and entry point. In it run the containers of the samples, with their
-own command lines and files: a server, a NATS server and a worker, which must do a job.
+"""Runs the containers of docker/ and deploy/kubernetes/ without Docker. It lays out a root like the last stage of
+docker/Dockerfile, with its user, environment and entry point. The containers of the samples run in it with their
+command lines and files: a server, a NATS server and a worker, which must complete a job.
 
 Usage: unshare --mount --net --pid --fork --kill-child --mount-proc image.py ROOT PROGRAM
 
-ROOT is the repository with runtime/, PROGRAM a build of sci-recon. The namespaces give the containers ports and mounts
-of their own, and end with this script. Ends with 1 and the reason if anything is wrong.
+ROOT is the repository with runtime/, PROGRAM a build of sci-recon. The namespaces isolate the ports and mounts of the
+containers, and end with this script. Ends with 1 and the reason if a sample does not work.
 """
 
 import json
@@ -30,7 +30,7 @@ PATIENCE = 120
 
 
 class Wrong(Exception):
-    """A sample that does not work."""
+    """Reports that a sample does not work."""
 
 
 def require(holds, reason):
@@ -51,10 +51,11 @@ class Image:
     def __init__(self, repository, program):
         self.environment = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"}
         self.users, self.folders, self.copies, self.health = {"root": 0}, [], [], None
+        self.packages = []
         built = {"/out/": [repository / "runtime", program]}
         for name, rest in instructions((repository / "docker/Dockerfile").read_text()):
             if name == "FROM":
-                require(rest == "debian:bookworm-slim", f"this script does not know the base image {rest}")
+                require(re.fullmatch(r"debian:12\.\d+-slim", rest), f"this script does not know the base image {rest}")
             elif name == "RUN":
                 for command in rest.split("&&"):
                     self.run(shlex.split(command))
@@ -71,10 +72,12 @@ class Image:
             elif name == "HEALTHCHECK":
                 self.health = json.loads(rest[rest.index("CMD") + 3:])
             else:
-                require(name in ("VOLUME", "EXPOSE", "STOPSIGNAL", "CMD"), f"{name} is not known here")
+                require(name in ("VOLUME", "EXPOSE", "STOPSIGNAL", "CMD", "LABEL"), f"{name} is not known here")
 
     def run(self, words):
-        if words[0] == "useradd":
+        if words[0] in ("apt-get", "rm"):
+            self.packages += words[words.index("--no-install-recommends") + 1 :] if "install" in words else []
+        elif words[0] == "useradd":
             self.users[words[-1]] = int(words[words.index("--uid") + 1])
         else:
             require(words[:3] == ["install", "-d", "-o"], f"RUN {words} is not known here")
@@ -103,6 +106,9 @@ class Image:
             place = root / str(library).strip("/")
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(library, place)
+        for package in self.packages:
+            require(package == "ca-certificates", f"this script does not know the package {package}")
+            shutil.copytree("/etc/ssl/certs", root / "etc/ssl/certs", symlinks=False, ignore_dangling_symlinks=True)
         for folder, uid in self.folders:
             place = root / folder.strip("/")
             place.mkdir()
@@ -120,7 +126,7 @@ def libraries(program):
 
 
 class Container:
-    """A root of its own, and what runs in it."""
+    """A container with a separate root, and its processes."""
 
     def __init__(self, name, folder, image=None, user=None, group=0):
         self.name, self.root, self.log = name, folder / name, folder / f"{name}.log"
@@ -134,17 +140,17 @@ class Container:
             (self.root / "data").mkdir(parents=True)
 
     def put(self, source, place, mode=None, group=None):
-        """A file that is mounted."""
+        """Copies a file to the path at which it is mounted."""
         target = self.root / place.strip("/")
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(source, target)
-        facts = source.stat()
-        os.chown(target, facts.st_uid if mode is None else 0, facts.st_gid if group is None else group)
+        metadata = source.stat()
+        os.chown(target, metadata.st_uid if mode is None else 0, metadata.st_gid if group is None else group)
         if mode is not None:
             target.chmod(mode)
 
     def folder(self, place, group):
-        """An empty volume for a group."""
+        """Creates an empty volume for a group."""
         target = self.root / place.strip("/")
         target.mkdir(parents=True, exist_ok=True)
         os.chown(target, 0, group)
@@ -163,7 +169,7 @@ class Container:
                                     preexec_fn=self.enter, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
     def run(self, words, entry=None):
-        """Status and standard output."""
+        """Runs a command; returns status and standard output."""
         done = subprocess.run([*(self.entry if entry is None else entry), *words], env=self.environment,
                               preexec_fn=self.enter, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
                               stderr=subprocess.PIPE)
@@ -194,21 +200,21 @@ def ready(server, process):
 
 
 def job(server, running):
-    """Has the worker do a job: the server leaves all tiles to others."""
+    """Runs a job on the worker, because the server leaves all tiles to other machines."""
     status, token = server.run(["token", "--data", "/data", "create", "--lab", "optics", "--role", "admin"])
-    require(status == 0 and token, "no token could be made")
-    made = ask(token, "/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
+    require(status == 0 and token, "no token could be created")
+    created = ask(token, "/v1/samples", {"algorithm": "gap-tv"})["job"]["id"]
     start = time.monotonic()
     while time.monotonic() - start < PATIENCE:
         for name, process in running.items():
             require(process.poll() is None, f"{name} ends with {process.returncode}")
-        state = ask(token, f"/v1/jobs/{made}?wait=5")["state"]
+        state = ask(token, f"/v1/jobs/{created}?wait=5")["state"]
         if state not in ("queued", "running"):
             require(state == "succeeded", f"the job is {state}")
             pools = [worker["pool"] for worker in ask(token, "/v1/system")["workers"] if worker.get("pool")]
             require(pools == ["default"], f"workers of the pools {pools} are known")
             return
-    raise Wrong(f"no worker has done the job after {PATIENCE} s")
+    raise Wrong(f"no worker has completed the job after {PATIENCE} s")
 
 
 def stop(running):
@@ -219,7 +225,7 @@ def stop(running):
 
 
 def services(repository):
-    """The services of docker/compose.yaml with what docker/cluster.yaml adds."""
+    """The services of docker/compose.yaml, extended by docker/cluster.yaml."""
     merged = {}
     for file in ["compose.yaml", "cluster.yaml"]:
         for name, service in yaml.safe_load((repository / "docker" / file).read_text())["services"].items():
@@ -230,15 +236,15 @@ def services(repository):
 
 
 def keys(repository, program, nats_server, folder):
-    """Carries out the lines of docker/cluster.yaml that come before `docker compose`, for this machine's NATS."""
+    """Runs the commands in docker/cluster.yaml before `docker compose`, with this machine's NATS."""
     text = (repository / "docker/cluster.yaml").read_text()
     lines = re.findall(r"^#   (.+)$", text, re.MULTILINE)
     require(lines and lines[-1].startswith("docker compose"), "docker/cluster.yaml begins with its commands")
     (folder / "bin").mkdir()
     (folder / "bin/sci-recon").symlink_to(program)
     path = f"{folder}/bin:/usr/sbin:{os.environ['PATH']}"
-    said = subprocess.run([nats_server, "--version"], capture_output=True, text=True).stdout
-    version = re.search(r"v([\d.]+)", said).group(1)
+    printed = subprocess.run([nats_server, "--version"], capture_output=True, text=True).stdout
+    version = re.search(r"v([\d.]+)", printed).group(1)
     for line in lines[:-1]:
         line = re.sub(r"--nats-version \S+", f"--nats-version {version}", line)
         done = subprocess.run(["sh", "-c", line], cwd=folder, env={**os.environ, "PATH": path}, capture_output=True,
@@ -255,7 +261,7 @@ def start_nats(nats, command, program):
 
 
 def compose(repository, image, folder, nats_server, host):
-    """docker compose -f docker/compose.yaml -f docker/cluster.yaml up"""
+    """Runs `docker compose -f docker/compose.yaml -f docker/cluster.yaml up` without Docker."""
     listed, containers, running = services(repository), {}, {}
     for name, service in listed.items():
         container = Container(name, folder, image if name != "nats" else None)
@@ -266,7 +272,7 @@ def compose(repository, image, folder, nats_server, host):
         containers[name] = container
     running["nats"] = start_nats(containers["nats"], listed["nats"]["command"], nats_server)
     status, token = containers["sci-recon"].run(["token", "create", "--lab", "optics", "--new"])
-    require(status == 0 and token, "the first token could not be made")
+    require(status == 0 and token, "the first token could not be created")
     running["sci-recon"] = containers["sci-recon"].start(listed["sci-recon"]["command"])
     ready(containers["sci-recon"], running["sci-recon"])
     running["worker"] = containers["worker"].start(listed["worker"]["command"])
@@ -279,7 +285,7 @@ def compose(repository, image, folder, nats_server, host):
 
 
 def kubernetes(repository, image, folder, nats_server, host):
-    """The pods of the server and of a worker, beside one node of NATS."""
+    """Runs the pods of the server and of a worker with one node of NATS."""
     nats = Container("nats", folder)
     nats.put(host / "cluster/nats-server.conf", "/nats.conf")
     running = {"nats": start_nats(nats, ["--config=/nats.conf"], nats_server)}
@@ -335,7 +341,7 @@ def main():
                     tail = log.read_text(errors="replace").splitlines()[-15:]
                     print(f"{sample.__name__}: {log.stem}:", *tail, sep="\n  ", file=sys.stderr)
                 print(f"{sample.__name__}: {error}", file=sys.stderr)
-                # With it end all processes of the namespace.
+                # All processes of the namespace end with it.
                 os._exit(1)
             finally:
                 for root in roots.iterdir():

@@ -3,12 +3,52 @@
 Usage: python_client.py FOLDER, with SCI_RECON_URL and SCI_RECON_TOKEN. Prints one JSON line.
 """
 
+import io
 import json
+import os
+import re
 import sys
+from base64 import b64decode
 from pathlib import Path
 
+import npe2
 import numpy as np
+import sci_recon
+from PIL import Image
 from sci_recon import ApiError, Client
+
+
+def napari(result):
+    """Opens the job by its addresses, and a folder of results, as napari does."""
+    manager = npe2.PluginManager.instance()
+    manifest = npe2.PluginManifest.from_file(Path(sci_recon.__file__).parent / "napari.yaml")
+    manifest.validate_imports()
+    manager.register(manifest)
+    folder = result.download("frames.npy", result.snapshots[0]).parent
+    (folder / "manifest.json").write_text(json.dumps(result.manifest))
+    url, job = os.environ["SCI_RECON_URL"], result.job
+    expected = {f"{url}/v1/jobs/{job.id}": result.frames, f"{url}/#/jobs/{job.id}": result.frames}
+    expected[str(folder)] = result.snapshot(result.snapshots[0])
+    for path, frames in expected.items():
+        [(data, settings, kind)] = npe2.read([path], stack=False)
+        assert kind == "image" and np.array_equal(data, frames), path
+        assert not settings["rgb"] and settings["contrast_limits"][1] > 0.1, settings
+    try:
+        npe2.read([str(folder / "frames.npy")], stack=False)
+        raise AssertionError("a file of another plugin was opened")
+    except ValueError:
+        pass
+
+
+def jupyter(result):
+    """The preview that a notebook shows."""
+    text = result._repr_html_()
+    assert result.job.verdict in text, text
+    picture = Image.open(io.BytesIO(b64decode(re.search(r"base64,([^\"]+)", text)[1])))
+    frames = result.snapshot(result.snapshots[0])
+    height, width = frames.shape[1:3]
+    assert picture.n_frames == len(frames) and 128 < max(picture.size) <= 384, picture
+    assert abs(picture.width / picture.height - width / height) < 0.02, picture
 
 
 def main():
@@ -36,6 +76,8 @@ def main():
         assert result.manifest["content"]["schedule"]
         text = repr(result)
         assert result.job.verdict in text and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text, text
+        napari(result)
+        jupyter(result)
         # A rejection raises the service's message, without a retry.
         try:
             client.reconstruct(masks * 3, measurement, "gap-tv")

@@ -29,7 +29,7 @@ def main():
     clips = {f"/snapshots/{index}": frames for index, frames in enumerate(snapshots)}
     clips["/sequence"] = np.concatenate(snapshots)
     assert (np.load(io.BytesIO(get("/sequence/frames.npy"))) == clips["/sequence"]).all()
-    told = {}
+    intervals = {}
     for place, frames in clips.items():
         with tifffile.TiffFile(io.BytesIO(get(f"{place}/stack.tif"))) as file:
             colours = frames.ndim == 4
@@ -46,7 +46,7 @@ def main():
             assert int(pixels.get("SizeT")) == len(frames)
             interval = pixels.get("TimeIncrement")
             assert interval is None or pixels.get("TimeIncrementUnit") == "s"
-            told[place] = [imagej.get("finterval"), interval and float(interval)]
+            intervals[place] = [imagej.get("finterval"), interval and float(interval)]
             planes = [float(plane.get("DeltaT")) for plane in pixels.findall("{*}Plane")]
             assert len(planes) in (0, len(frames)) and planes == sorted(planes)
         array = zarr.open_array(
@@ -65,7 +65,7 @@ def main():
     # An interrupted download can be continued.
     cut = len(archive) // 3
     assert archive[:cut] + get("/results.zip", Range=f"bytes={cut}-") == archive
-    print(json.dumps({"intervals": told, "members": len(names)}))
+    print(json.dumps({"intervals": intervals, "members": len(names)}))
 
 
 main()

@@ -1,4 +1,4 @@
-//! Tokens, roles and labs: what each may do, and how the data of labs are kept apart.
+//! Tokens and roles, their permissions, and the isolation of labs.
 
 use std::process::{Command, Stdio};
 
@@ -133,9 +133,9 @@ async fn data_of_another_lab_look_nonexistent() {
     let theirs = app.post("/v1/calibrations", &named(&masks)).await;
     theirs.problem(422, "invalid_request");
     same(theirs, app.post("/v1/calibrations", &named(&zeros)).await, (&masks, &zeros));
-    let of = |calibration: &str| json!({"calibration": calibration, "data": zeros});
-    let theirs = app.post("/v1/measurements", &of(&calibration)).await;
-    same(theirs, app.post("/v1/measurements", &of(nowhere)).await, (&calibration, nowhere));
+    let body_for = |calibration: &str| json!({"calibration": calibration, "data": zeros});
+    let theirs = app.post("/v1/measurements", &body_for(&calibration)).await;
+    same(theirs, app.post("/v1/measurements", &body_for(nowhere)).await, (&calibration, nowhere));
     let theirs = app.post("/v1/jobs", &body).await;
     let unknown = json!({"measurement": nowhere, "algorithm": "gap-tv"});
     same(theirs, app.post("/v1/jobs", &unknown).await, (&measurement, nowhere));
@@ -145,8 +145,8 @@ async fn data_of_another_lab_look_nonexistent() {
     assert_eq!(sent.expect(201).json()["sha256"], masks);
     // Idempotency keys are separate as well.
     let (_, measurement) = app.scene(&Scene::SMALL).await;
-    let own = json!({"measurement": measurement, "algorithm": "gap-tv"});
-    assert_ne!(id(&app.send(keyed().json(&own)).await.expect(201)), job);
+    let own_job = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_ne!(id(&app.send(keyed().json(&own_job)).await.expect(201)), job);
     // The bytes are stored once, and remain until no lab needs them.
     let blobs = std::fs::read_dir(app.data().join("blobs")).unwrap().count();
     assert_eq!(blobs, 4, "masks, data, and the arrays prepared from them");
@@ -215,8 +215,8 @@ async fn a_token_appears_in_no_log_and_no_file() {
     for file in files {
         let bytes = std::fs::read(&file).unwrap();
         assert!(!bytes.is_empty() || file.ends_with("server.lock"));
-        let found = bytes.windows(secret.len()).any(|window| window == secret);
-        assert!(!found, "{} holds the token", file.display());
+        let contains_token = bytes.windows(secret.len()).any(|window| window == secret);
+        assert!(!contains_token, "{} holds the token", file.display());
     }
 }
 
@@ -235,11 +235,7 @@ async fn a_page_of_another_site_has_no_access_to_an_open_service() {
     assert_eq!(ask(Method::GET, &[("host", "bench.example")]).await, 200);
     assert_eq!(ask(Method::POST, &[("origin", "http://evil.example")]).await, 403);
     assert_eq!(ask(Method::POST, &[("sec-fetch-site", "cross-site")]).await, 403);
-    assert_eq!(
-        ask(Method::POST, &[]).await,
-        422,
-        "the request passes all checks but that of its body"
-    );
+    assert_eq!(ask(Method::POST, &[]).await, 422, "only the check of its body rejects the request");
     app.token(&["create", "--lab", "optics"]);
     assert_eq!(ask(Method::GET, &[("host", "evil.example")]).await, 401, "a token is required now");
 }

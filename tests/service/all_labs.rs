@@ -13,26 +13,26 @@ async fn three_tokens() -> (TestApp, [String; 3], String) {
     let app = TestApp::start().await;
     let a = app.token(&["create", "--lab", "a"]);
     let b = app.token(&["create", "--lab", "b", "--role", "admin"]);
-    let all = app.token(&["create", "--lab", "ops", "--role", "admin", "--all-labs"]);
+    let all_labs = app.token(&["create", "--lab", "ops", "--role", "admin", "--all-labs"]);
     app.sign_in(&a);
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     let job = id(&app.post("/v1/jobs", &body).await.expect(201));
-    (app, [a, b, all], job)
+    (app, [a, b, all_labs], job)
 }
 
 #[tokio::test]
 async fn only_a_token_for_all_labs_sets_a_high_priority() {
     let (app, [a, _, all], job) = three_tokens().await;
     app.sign_in(&a);
-    let place = format!("/v1/jobs/{job}");
-    let measurement = app.get(&place).await.json()["measurement"].clone();
+    let path = format!("/v1/jobs/{job}");
+    let measurement = app.get(&path).await.json()["measurement"].clone();
     let with = |priority: i32| json!({"measurement": measurement, "algorithm": "gap-tv", "priority": priority});
     for priority in [1, 100] {
         for refused in [
             app.post("/v1/jobs", &with(priority)).await,
             app.post("/v1/jobs/estimate", &with(priority)).await,
-            app.send(app.request(Method::PATCH, &place).json(&json!({"priority": priority}))).await,
+            app.send(app.request(Method::PATCH, &path).json(&json!({"priority": priority}))).await,
         ] {
             let detail = refused.problem(422, "invalid_request");
             assert!(detail.contains("-100 to 0"), "{detail}");
@@ -59,13 +59,13 @@ async fn only_a_token_for_all_labs_sees_and_changes_other_labs() {
     app.get("/v1/blobs?lab=*").await.problem(404, "not_found");
     assert_eq!(app.get("/v1/blobs?lab=a").await.json()["items"].as_array().unwrap().len(), 2);
     // It may change a priority, cancel, and set a limit.
-    let place = format!("/v1/jobs/{job}");
-    app.get(&place).await.problem(404, "not_found");
-    let change = app.request(Method::PATCH, &format!("{place}?lab=a"));
+    let job_path = format!("/v1/jobs/{job}");
+    app.get(&job_path).await.problem(404, "not_found");
+    let change = app.request(Method::PATCH, &format!("{job_path}?lab=a"));
     let changed = app.send(change.json(&json!({"priority": 7}))).await.expect(200);
     assert_eq!(changed.json()["priority"], 7);
-    app.post(&format!("{place}/cancel?lab=a"), &json!({})).await.expect(202);
-    assert_eq!(app.get(&format!("{place}?lab=a")).await.json()["state"], "cancelled");
+    app.post(&format!("{job_path}/cancel?lab=a"), &json!({})).await.expect(202);
+    assert_eq!(app.get(&format!("{job_path}?lab=a")).await.json()["state"], "cancelled");
     let set = |body: Value| app.send(app.request(Method::PATCH, "/v1/labs/a").json(&body));
     let lab =
         set(json!({"share": 2.5, "bytes": 1_000_000_000, "jobs": 3})).await.expect(200).json();
@@ -85,7 +85,7 @@ async fn only_a_token_for_all_labs_sees_and_changes_other_labs() {
     app.sign_in(&app.token(&["create", "--lab", "ops", "--role", "read", "--all-labs"]));
     app.get("/v1/labs").await.expect(200);
     set(json!({"share": 9})).await.problem(403, "forbidden");
-    app.delete(&format!("{place}?lab=a")).await.problem(403, "forbidden");
+    app.delete(&format!("{job_path}?lab=a")).await.problem(403, "forbidden");
     // An admin of one lab has no access to other labs, whether they exist or not.
     app.sign_in(&b);
     for path in
@@ -94,7 +94,7 @@ async fn only_a_token_for_all_labs_sees_and_changes_other_labs() {
         app.get(path).await.problem(403, "forbidden");
     }
     assert_eq!(app.get("/v1/jobs?lab=b").await.json()["items"], json!([]));
-    app.delete(&format!("{place}?lab=a")).await.problem(403, "forbidden");
+    app.delete(&format!("{job_path}?lab=a")).await.problem(403, "forbidden");
     app.sign_in(&a);
     assert_eq!(app.get("/v1/me").await.json()["limits"]["lab_jobs"], 3);
 }
@@ -115,45 +115,45 @@ async fn the_command_line_sees_and_changes_all_labs() {
     assert_eq!(command(&["job", "priority", &job, "-5"]).0, 0);
     assert_eq!(command(&["job", "priority", &job, "500"]).0, 2);
     app.sign_in(&a);
-    let place = format!("/v1/jobs/{job}");
-    assert_eq!(app.get(&place).await.json()["priority"], -5);
+    let path = format!("/v1/jobs/{job}");
+    assert_eq!(app.get(&path).await.json()["priority"], -5);
     assert_eq!(command(&["job", "delete", &job]).0, 2, "it has not ended");
     assert!(command(&["job", "cancel", &job]).1.contains("cancelled"));
-    assert_eq!(app.get(&place).await.json()["state"], "cancelled");
+    assert_eq!(app.get(&path).await.json()["state"], "cancelled");
     assert!(command(&["job", "retry", &job]).1.contains("queued"));
     command(&["job", "cancel", &job]);
     assert_eq!(command(&["job", "delete", &job]).0, 0);
-    app.get(&place).await.problem(404, "not_found");
+    app.get(&path).await.problem(404, "not_found");
     assert_eq!(command(&["job", "cancel", &job]).0, 2);
     let unused = app.upload(vec![7; 5000]).await;
     let (_, uploads) = command(&["lab", "uploads", "a"]);
-    let of = |sha256: &str| uploads.lines().find(|line| line.starts_with(sha256)).unwrap();
-    assert!(of(&unused).ends_with("no"), "{uploads}");
+    let line_of = |sha256: &str| uploads.lines().find(|line| line.starts_with(sha256)).unwrap();
+    assert!(line_of(&unused).ends_with("no"), "{uploads}");
     assert_eq!(uploads.lines().filter(|line| line.ends_with("yes")).count(), 2, "{uploads}");
     assert_eq!(command(&["lab", "delete-upload", "a", &unused]).0, 0);
     app.get(&format!("/v1/blobs/{unused}")).await.problem(404, "not_found");
 
-    // A name that was mistyped makes no lab, and one that has nothing can go.
-    let (code, said) = command(&["lab", "set", "c", "--share", "2"]);
-    assert!(code == 2 && said.contains("--new"), "{said}");
+    // A mistyped name creates no lab, and an empty lab can be removed.
+    let (code, message) = command(&["lab", "set", "c", "--share", "2"]);
+    assert!(code == 2 && message.contains("--new"), "{message}");
     let listed = command(&["lab", "set", "c", "--new", "--share", "2"]).1;
     assert!(listed.lines().any(|line| line.starts_with("c ")), "{listed}");
     assert_eq!(command(&["lab", "remove", "c"]).0, 0);
-    assert_eq!(command(&["lab", "remove", "c"]).0, 2, "it is gone");
+    assert_eq!(command(&["lab", "remove", "c"]).0, 2, "the lab was removed");
     let listed = command(&["lab", "list"]).1;
     assert!(!listed.lines().any(|line| line.starts_with("c ")), "{listed}");
     let tokens = app.token(&["list"]);
     let token = tokens.lines().find(|line| line.contains(" b ")).unwrap();
-    let (code, said) = command(&["lab", "remove", "b"]);
-    assert!(code == 2 && said.contains("tokens"), "{said}");
+    let (code, message) = command(&["lab", "remove", "b"]);
+    assert!(code == 2 && message.contains("tokens"), "{message}");
     app.token(&["revoke", token.split_whitespace().next().unwrap()]);
     assert_eq!(command(&["lab", "remove", "b"]).0, 0);
     app.upload(vec![8; 5000]).await;
     for token in tokens.lines().filter(|line| line.contains(" a ")) {
         app.token(&["revoke", token.split_whitespace().next().unwrap()]);
     }
-    let (code, said) = command(&["lab", "remove", "a"]);
-    assert!(code == 2 && said.contains("delete those first"), "{said}");
+    let (code, message) = command(&["lab", "remove", "a"]);
+    assert!(code == 2 && message.contains("delete those first"), "{message}");
 }
 
 #[tokio::test]
@@ -185,8 +185,8 @@ async fn a_token_expires_and_records_its_last_use() {
     tokio::time::timeout(Duration::from_secs(20), rest).await.expect("the stream ends");
     app.get("/v1/me").await.problem(401, "unauthorized");
     app.sign_out();
-    let asked = app.request(Method::GET, "/v1/jobs").header("cookie", session);
-    app.send(asked).await.problem(401, "unauthorized");
+    let request = app.request(Method::GET, "/v1/jobs").header("cookie", session);
+    app.send(request).await.problem(401, "unauthorized");
     app.sign_in(&lasting);
     app.get("/v1/me").await.expect(200);
 }
@@ -218,18 +218,18 @@ async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
     let jobs = app.send(ask(Method::GET, "/v1/jobs", &[])).await.expect(200);
     assert_eq!(jobs.json()["items"][0]["id"], job.as_str());
     let cancel = format!("/v1/jobs/{job}/cancel");
-    let own = ("x-requested-with", "page");
+    let header = ("x-requested-with", "page");
     for lines in [
         &[][..],
-        &[own, ("origin", "http://evil.example")],
-        &[own, ("sec-fetch-site", "cross-site")],
+        &[header, ("origin", "http://evil.example")],
+        &[header, ("sec-fetch-site", "cross-site")],
         &[("sec-fetch-site", "same-origin")],
     ] {
         let refused = app.send(ask(Method::POST, &cancel, lines)).await;
         refused.problem(403, "foreign_site");
     }
-    app.send(ask(Method::POST, "/v1/session", &[own])).await.problem(401, "unauthorized");
-    let same = [own, ("sec-fetch-site", "same-origin")];
+    app.send(ask(Method::POST, "/v1/session", &[header])).await.problem(401, "unauthorized");
+    let same = [header, ("sec-fetch-site", "same-origin")];
     app.send(ask(Method::POST, &cancel, &same)).await.expect(202);
     let other = app.send(app.request(Method::POST, "/v1/session").bearer_auth(&a)).await;
     let ended = app.send(ask(Method::DELETE, "/v1/session", &same)).await.expect(204);
@@ -237,19 +237,19 @@ async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
     app.send(ask(Method::GET, "/v1/jobs", &[])).await.problem(401, "unauthorized");
     // Revoking a token ends its sessions.
     let session = other.header("set-cookie").split(';').next().unwrap().to_owned();
-    let look = || app.request(Method::GET, "/v1/jobs").header("cookie", &session);
-    app.send(look()).await.expect(200);
+    let list_jobs = || app.request(Method::GET, "/v1/jobs").header("cookie", &session);
+    app.send(list_jobs()).await.expect(200);
     let listed = app.token(&["list"]);
     let row = listed.lines().find(|line| line.contains("submit")).unwrap();
     app.token(&["revoke", row.split(' ').next().unwrap()]);
-    app.send(look()).await.problem(401, "unauthorized");
+    app.send(list_jobs()).await.problem(401, "unauthorized");
 }
 
 #[tokio::test]
 async fn a_service_without_tokens_needs_no_session() {
     let app = TestApp::start().await;
-    let asked = app.send(app.request(Method::POST, "/v1/session")).await;
-    asked.problem(409, "illegal_state");
+    let session = app.send(app.request(Method::POST, "/v1/session")).await;
+    session.problem(409, "illegal_state");
     assert_eq!(app.get("/v1/me").await.json()["all_labs"], true);
     app.send(app.request(Method::DELETE, "/v1/session")).await.expect(204);
 }
@@ -258,7 +258,7 @@ async fn a_service_without_tokens_needs_no_session() {
 async fn a_download_ends_with_its_token() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a"]));
-    // Larger than the buffers of a connection.
+    // The file is larger than the buffers of a connection.
     let sha256 = app.upload(vec![3; 40_000_000]).await;
     let path = format!("/v1/blobs/{sha256}/content");
     let mut download = app.request(Method::GET, &path).send().await.unwrap();

@@ -3,6 +3,8 @@
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::mpsc;
+use std::time::Duration;
 
 use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
@@ -93,7 +95,7 @@ impl TestApp {
         Self::try_in_environment(arguments, environment).await.expect("the server starts")
     }
 
-    /// Starts the service; none if it does not start.
+    /// Starts the service. Returns `None` if it does not start.
     pub async fn try_in_environment(
         arguments: &[&str],
         environment: &[(&str, &str)],
@@ -118,7 +120,9 @@ impl TestApp {
     ) -> Self {
         let data = folder.path().join(subfolder);
         let (arguments, token) = (owned(arguments), std::sync::RwLock::default());
-        Self { _folder: folder, data, process, url, client: Client::new(), arguments, token }
+        // A server that stops answering fails the test.
+        let client = Client::builder().read_timeout(LONGEST_SILENCE).build().unwrap();
+        Self { _folder: folder, data, process, url, client, arguments, token }
     }
 
     /// Restarts the service on the same data with other arguments.
@@ -169,6 +173,7 @@ impl TestApp {
     pub fn stop(&mut self) -> std::process::ExitStatus {
         let pid = rustix::process::Pid::from_raw(self.process.id() as i32).unwrap();
         rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+        let _limit = kill_after(self.process.id(), LONGEST_SILENCE);
         self.process.wait().unwrap()
     }
 
@@ -213,7 +218,7 @@ impl TestApp {
         let request = request.unwrap();
         let (method, path) = (request.method().clone(), request.url().path().to_owned());
         let answer = Answer::read(client.execute(request).await.unwrap()).await;
-        contract::hold(&method, &path, &answer);
+        contract::check(&method, &path, &answer);
         answer
     }
 
@@ -269,14 +274,23 @@ impl TestApp {
     }
 }
 
-/// Python with the packages of tests/judges/requirements.txt, or none after [`skip`].
+/// Path of a Python with the packages of tests/judges/requirements.txt. Calls [`skip`] if there is none.
 #[track_caller]
 pub fn judges() -> Option<String> {
-    let python = std::env::var("SCI_RECON_JUDGES").ok();
+    python("SCI_RECON_JUDGES", "tests/judges/requirements.txt")
+}
+
+/// Path of a Python with the packages of research/training/requirements.txt. Calls [`skip`] if there is none.
+#[track_caller]
+pub fn training() -> Option<String> {
+    python("SCI_RECON_TRAINING", "research/training/requirements.txt")
+}
+
+#[track_caller]
+fn python(variable: &str, requirements: &str) -> Option<String> {
+    let python = std::env::var(variable).ok();
     if python.is_none() {
-        skip(
-            "SCI_RECON_JUDGES names no Python with tests/judges/requirements.txt: run `make judges`",
-        );
+        skip(&format!("{variable} names no Python with {requirements}: run `make test`"));
     }
     python
 }
@@ -325,11 +339,36 @@ impl Drop for TestApp {
     }
 }
 
+/// Longest time in which a healthy server starts, answers or ends, on a busy machine.
+const LONGEST_SILENCE: Duration = Duration::from_secs(180);
+
+/// The program with a time limit. Without the limit, a server that should have been refused would run forever.
+pub fn bounded_program() -> Command {
+    let mut command = Command::new("timeout");
+    command.arg(LONGEST_SILENCE.as_secs().to_string()).arg(env!("CARGO_BIN_EXE_sci-recon"));
+    command
+}
+
+/// Kills the process after this time, unless the returned value is dropped before.
+fn kill_after(process: u32, limit: Duration) -> mpsc::Sender<()> {
+    let (alive, dropped) = mpsc::channel();
+    std::thread::spawn(move || {
+        let expired = dropped.recv_timeout(limit) == Err(mpsc::RecvTimeoutError::Timeout);
+        if let Some(pid) = rustix::process::Pid::from_raw(process.cast_signed()).filter(|_| expired)
+        {
+            eprintln!("process {process} is killed after {limit:?}");
+            // The process may have ended already.
+            let _ = rustix::process::kill_process(pid, rustix::process::Signal::KILL);
+        }
+    });
+    alive
+}
+
 fn owned(arguments: &[&str]) -> Vec<String> {
     arguments.iter().map(|&text| text.to_owned()).collect()
 }
 
-/// The server and its address; none if it ends before it prints one.
+/// Starts a server, and returns it with its address. Returns `None` if it ends before it prints the address.
 fn spawn(
     data: &Path,
     arguments: &[String],
@@ -348,7 +387,9 @@ fn spawn(
         .spawn()
         .unwrap();
     let mut line = String::new();
+    let limit = kill_after(process.id(), LONGEST_SILENCE);
     BufReader::new(process.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    drop(limit);
     let Ok(announced) = serde_json::from_str::<Value>(&line) else {
         process.wait().unwrap();
         return None;

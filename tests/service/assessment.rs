@@ -60,8 +60,8 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
     let second = &values[blocks.0 * blocks.1..];
     for (row, column) in [(0, 0), (17, 3), (height - 1, width - 1)] {
         let expected = (second[row / 16 * blocks.1 + column / 16] * 510.0).min(255.0);
-        let found = f32::from(shown[row * columns + column]);
-        assert!((found - expected).abs() <= 0.51, "{row}, {column}: {found} for {expected}");
+        let actual = f32::from(shown[row * columns + column]);
+        assert!((actual - expected).abs() <= 0.51, "{row}, {column}: {actual} for {expected}");
     }
     app.get(&format!("{base}/pictures/error-{}", frames + 1)).await.problem(404, "not_found");
 }
@@ -91,18 +91,21 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
     let folder = app.data().join("results").join(&job).join("snapshot_0001");
     let plain = format!("/v1/jobs/{job}/snapshots/1/stack.exr");
     let path = format!("{plain}?layers=sigma");
-    let whole = app.get(&path).await.expect(200);
-    let (size, etag) = (whole.bytes.len(), whole.header("etag").to_owned());
-    assert_eq!(whole.header("content-type"), "image/x-exr");
-    assert!(whole.header("content-disposition").ends_with("_0001_stack-sigma.exr\""), "{whole:?}");
+    let complete = app.get(&path).await.expect(200);
+    let (size, etag) = (complete.bytes.len(), complete.header("etag").to_owned());
+    assert_eq!(complete.header("content-type"), "image/x-exr");
+    assert!(
+        complete.header("content-disposition").ends_with("_0001_stack-sigma.exr\""),
+        "{complete:?}"
+    );
 
     // Other readers find the original frames, and the layer in addition.
-    let made = tempfile::NamedTempFile::new().unwrap();
-    std::fs::write(made.path(), &whole.bytes).unwrap();
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), &complete.bytes).unwrap();
     if let Some(python) = judges() {
         let mut judge = tokio::process::Command::new(python);
         judge.arg("tests/judges/read_exr.py").arg(&folder).args(["--attribute", "algorithm"]);
-        let output = judge.arg("--sigma").arg(made.path()).output().await.unwrap();
+        let output = judge.arg("--sigma").arg(file.path()).output().await.unwrap();
         let report = String::from_utf8_lossy(&output.stdout).into_owned();
         assert!(output.status.success(), "{report}{}", String::from_utf8_lossy(&output.stderr));
     }
@@ -115,7 +118,7 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
         let last = (first + size / 4).min(size - 1);
         let part = app.request(Method::GET, &path).header("range", format!("bytes={first}-{last}"));
         let part = app.send(part.header("if-range", &etag)).await.expect(206);
-        assert!(part.bytes == whole.bytes[first..=last], "{first} to {last}");
+        assert!(part.bytes == complete.bytes[first..=last], "{first} to {last}");
     }
 
     // Without the parameter, the original file is sent.

@@ -38,7 +38,7 @@ impl Lab {
         std::fs::write(&clip, npy(&[FRAMES, SIDE, SIDE], pixels)).unwrap();
         let toml = folder.path().join("optics.toml");
         std::fs::write(&toml, optics).unwrap();
-        let made = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+        let output = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
             .args([
                 "simulate",
                 "--compression-ratio",
@@ -52,7 +52,7 @@ impl Lab {
             .args(["--out".as_ref(), folder.path().join("sim").as_os_str()])
             .output()
             .unwrap();
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         Self { folder }
     }
 
@@ -178,11 +178,11 @@ async fn captures_give_masks_within_their_statistical_error() {
         let scale = figures["mask_scale"].as_f64().unwrap();
         let truth = values(&lab.file("masks.npy"));
         let true_scale = lab.json("simulation.json")["mask_scale"].as_f64().unwrap();
-        let made = masks(&app, &calibration);
-        assert_eq!(made.len(), truth.len());
-        let errors = made.iter().zip(&truth);
+        let computed = masks(&app, &calibration);
+        assert_eq!(computed.len(), truth.len());
+        let errors = computed.iter().zip(&truth);
         let errors: Vec<f64> = errors
-            .map(|(made, truth)| f64::from(*made) * scale - f64::from(*truth) * true_scale)
+            .map(|(computed, truth)| f64::from(*computed) * scale - f64::from(*truth) * true_scale)
             .collect();
         let rms = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
         let expected = figures["noise"].as_f64().unwrap() * scale;
@@ -220,9 +220,9 @@ fn the_command_line_calibrates_like_the_service() {
             .output()
             .unwrap()
     };
-    let made = run(&index);
-    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let report: Value = serde_json::from_slice(&made.stdout).unwrap();
+    let output = run(&index);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(report["grade"], "good", "{report:#}");
     let masks = values(&std::fs::read(out.join("masks.npy")).unwrap());
     assert_eq!(masks.len(), FRAMES * SIDE * SIDE);
@@ -284,24 +284,24 @@ async fn typical_errors_of_a_lab_are_found() {
     assert_eq!(codes(&good).await, []);
     let mut wrong = good.clone();
     wrong["black_with_mask"] = good["masks"][0].clone();
-    let seen = codes(&wrong).await;
-    assert!(seen.iter().any(|(code, _)| code == "wrong_dark"), "{seen:?}");
+    let found_codes = codes(&wrong).await;
+    assert!(found_codes.iter().any(|(code, _)| code == "wrong_dark"), "{found_codes:?}");
     let mut missing = good.clone();
     missing["masks"][3] = good["black_with_mask"].clone();
-    let seen = codes(&missing).await;
-    assert!(seen.contains(&("missing_pattern".into(), vec![3])), "{seen:?}");
+    let found_codes = codes(&missing).await;
+    assert!(found_codes.contains(&("missing_pattern".into(), vec![3])), "{found_codes:?}");
     let mut twice = good.clone();
     twice["masks"][3] = good["masks"][2].clone();
-    let seen = codes(&twice).await;
-    assert!(seen.contains(&("repeated_pattern".into(), vec![2, 3])), "{seen:?}");
+    let found_codes = codes(&twice).await;
+    assert!(found_codes.contains(&("repeated_pattern".into(), vec![2, 3])), "{found_codes:?}");
     let mut swapped = good.clone();
     swapped["masks"][1] = good["masks"][5].clone();
     swapped["masks"][5] = good["masks"][1].clone();
-    let seen = codes(&swapped).await;
-    assert_eq!(seen, [("swapped_order".into(), vec![1, 5])]);
+    let found_codes = codes(&swapped).await;
+    assert_eq!(found_codes, [("swapped_order".into(), vec![1, 5])]);
     let bright = Lab::new("[camera]\ncalibration_exposure = 1.2\n").send(&app).await;
-    let seen = codes(&bright).await;
-    assert!(seen.iter().any(|(code, _)| code == "saturated_white"), "{seen:?}");
+    let found_codes = codes(&bright).await;
+    assert!(found_codes.iter().any(|(code, _)| code == "saturated_white"), "{found_codes:?}");
 }
 
 #[tokio::test]

@@ -11,7 +11,7 @@ use crate::samples::{Scene, constant, npy_header};
 const CALIBRATIONS: &str = "/v1/calibrations";
 const MEASUREMENTS: &str = "/v1/measurements";
 
-/// Masks of 32 MB with half of the pixels open. Their check takes a while.
+/// Masks of 32 MB with half of the pixels open. Their check takes several seconds.
 fn large_masks() -> Vec<u8> {
     let mut file = npy_header("|u1", &[64, 512, 1024]);
     let mut state = 1_u64;
@@ -47,14 +47,14 @@ async fn a_long_check_continues_after_the_answer() {
     let app = TestApp::start().await;
     let masks = app.upload(large_masks()).await;
     let body = json!({"masks": masks, "name": "before"});
-    let asked = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
-    let calibration = id(&asked);
-    assert_eq!(asked.header("location"), format!("{CALIBRATIONS}/{calibration}"));
-    let shown = asked.json();
+    let accepted = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    let calibration = id(&accepted);
+    assert_eq!(accepted.header("location"), format!("{CALIBRATIONS}/{calibration}"));
+    let shown = accepted.json();
     assert_eq!((&shown["state"], &shown["frames"]), (&json!("preparing"), &Value::Null));
-    // During the check: the key, dependent resources, the file, the name, and the list.
-    let again = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
-    assert_eq!(id(&again), calibration);
+    // Uses the key, dependent resources, the file, the name and the list during the check.
+    let repeated = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    assert_eq!(id(&repeated), calibration);
     let other = app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await;
     other.problem(422, "idempotency_key_reused");
     let data = app.upload(constant(&[1, 512, 1024], 8.0)).await;
@@ -63,8 +63,8 @@ async fn a_long_check_continues_after_the_answer() {
     early.problem(409, "calibration_not_ready");
     assert_eq!(early.json()["retryable"], true);
     app.delete(&format!("/v1/blobs/{masks}")).await.problem(409, "in_use");
-    let place = format!("{CALIBRATIONS}/{calibration}");
-    let named = app.request(Method::PATCH, &place).json(&json!({"name": "after"}));
+    let path = format!("{CALIBRATIONS}/{calibration}");
+    let named = app.request(Method::PATCH, &path).json(&json!({"name": "after"}));
     assert_eq!(app.send(named).await.expect(200).json()["state"], "preparing");
     let listed = app.get(CALIBRATIONS).await.expect(200).json();
     assert_eq!(listed["items"][0]["state"], "preparing", "the check is too short for this test");
@@ -72,25 +72,25 @@ async fn a_long_check_continues_after_the_answer() {
     let shown = app.checked(CALIBRATIONS, &calibration).await;
     assert_eq!((&shown["state"], &shown["frames"]), (&json!("ready"), &json!(64)));
     assert_eq!((&shown["name"], &shown["problem"]), (&json!("after"), &Value::Null));
-    assert_eq!(shown["created_at"], asked.json()["created_at"]);
+    assert_eq!(shown["created_at"], accepted.json()["created_at"]);
     let listed = app.get(CALIBRATIONS).await.expect(200).json();
     assert_eq!(listed["items"].as_array().unwrap().len(), 1);
     assert_eq!(id(&app.ask(CALIBRATIONS, &body, "k").await.expect(200)), calibration);
 
-    // The same holds for a measurement.
-    let asked = app.ask(MEASUREMENTS, &measurement, "k").await.expect(202);
-    assert_eq!(asked.json()["state"], "preparing");
-    let job = json!({"measurement": id(&asked), "algorithm": "gap-tv"});
+    // A measurement is checked in the same way.
+    let accepted = app.ask(MEASUREMENTS, &measurement, "k").await.expect(202);
+    assert_eq!(accepted.json()["state"], "preparing");
+    let job = json!({"measurement": id(&accepted), "algorithm": "gap-tv"});
     let early = app.post("/v1/jobs", &job).await;
     early.problem(409, "measurement_not_ready");
     assert_eq!(early.json()["retryable"], true);
-    app.delete(&place).await.problem(409, "in_use");
+    app.delete(&path).await.problem(409, "in_use");
     let listed = app.get(&format!("{MEASUREMENTS}?calibration={calibration}")).await.expect(200);
-    assert_eq!(listed.json()["items"][0]["id"], asked.json()["id"]);
-    let shown = app.checked(MEASUREMENTS, &id(&asked)).await;
+    assert_eq!(listed.json()["items"][0]["id"], accepted.json()["id"]);
+    let shown = app.checked(MEASUREMENTS, &id(&accepted)).await;
     assert_eq!((&shown["state"], &shown["snapshots"]), (&json!("ready"), &json!(1)));
     app.post("/v1/jobs", &job).await.expect(201);
-    assert_eq!(id(&app.ask(MEASUREMENTS, &measurement, "k").await.expect(200)), id(&asked));
+    assert_eq!(id(&app.ask(MEASUREMENTS, &measurement, "k").await.expect(200)), id(&accepted));
 }
 
 #[tokio::test]
@@ -100,8 +100,8 @@ async fn a_failed_check_has_the_same_problem_as_a_direct_answer() {
     let body = json!({"masks": masks});
     let direct = app.post(CALIBRATIONS, &body).await;
     direct.problem(422, "invalid_content");
-    let asked = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
-    let failed = app.checked(CALIBRATIONS, &id(&asked)).await;
+    let accepted = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    let failed = app.checked(CALIBRATIONS, &id(&accepted)).await;
     assert_eq!((&failed["state"], &failed["error"]), (&json!("failed"), &direct.json()["detail"]));
     let same = |problem: &Value| {
         let mut problem = problem.clone();
@@ -110,35 +110,35 @@ async fn a_failed_check_has_the_same_problem_as_a_direct_answer() {
     };
     let (later, request) = same(&failed["problem"]);
     assert_eq!(later, same(&direct.json()).0);
-    assert_eq!(request, format!("urn:sci-recon:request:{}", asked.header("x-request-id")));
+    assert_eq!(request, format!("urn:sci-recon:request:{}", accepted.header("x-request-id")));
     // Waiting for a failed calibration is useless.
     let data = app.upload(constant(&[48, 64], 1.0)).await;
-    let needs = json!({"calibration": id(&asked), "data": data});
+    let needs = json!({"calibration": id(&accepted), "data": data});
     let refused = app.post(MEASUREMENTS, &needs).await;
     refused.problem(409, "calibration_not_ready");
     assert_eq!(refused.json()["retryable"], false);
     // The key and the file can be used again.
-    let again = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
-    assert_ne!(id(&again), id(&asked));
-    app.checked(CALIBRATIONS, &id(&again)).await;
+    let repeated = app.ask(CALIBRATIONS, &body, "k").await.expect(202);
+    assert_ne!(id(&repeated), id(&accepted));
+    app.checked(CALIBRATIONS, &id(&repeated)).await;
     app.delete(&format!("/v1/blobs/{masks}")).await.expect(204);
-    app.delete(&format!("{CALIBRATIONS}/{}", id(&asked))).await.expect(204);
-    app.get(&format!("{CALIBRATIONS}/{}", id(&asked))).await.problem(404, "not_found");
+    app.delete(&format!("{CALIBRATIONS}/{}", id(&accepted))).await.expect(204);
+    app.get(&format!("{CALIBRATIONS}/{}", id(&accepted))).await.problem(404, "not_found");
 
     let calibration = id(&app.calibrate(Scene::SMALL.masks()).await.expect(201));
     let data = app.upload(constant(&[48, 48], 1.0)).await;
     let body = json!({"calibration": calibration, "data": data});
     let direct = app.post(MEASUREMENTS, &body).await;
     direct.problem(422, "size_mismatch");
-    let asked = app.ask(MEASUREMENTS, &body, "k").await.expect(202);
-    let failed = app.checked(MEASUREMENTS, &id(&asked)).await;
+    let accepted = app.ask(MEASUREMENTS, &body, "k").await.expect(202);
+    let failed = app.checked(MEASUREMENTS, &id(&accepted)).await;
     assert_eq!(same(&failed["problem"]).0, same(&direct.json()).0);
-    let job = json!({"measurement": id(&asked), "algorithm": "gap-tv"});
+    let job = json!({"measurement": id(&accepted), "algorithm": "gap-tv"});
     let refused = app.post("/v1/jobs", &job).await;
     refused.problem(409, "measurement_not_ready");
     assert_eq!(refused.json()["retryable"], false);
     app.delete(&format!("{CALIBRATIONS}/{calibration}")).await.expect(204);
-    let place = format!("{MEASUREMENTS}/{}", id(&asked));
+    let place = format!("{MEASUREMENTS}/{}", id(&accepted));
     app.delete(&place).await.expect(204);
     app.get(&place).await.problem(404, "not_found");
 }
@@ -150,12 +150,12 @@ async fn a_check_survives_a_killed_server_but_not_its_deletion() {
     let body = json!({"masks": masks});
     let calibration = id(&app.ask(CALIBRATIONS, &body, "k").await.expect(202));
     app.restart();
-    let place = format!("{CALIBRATIONS}/{calibration}");
-    let shown = app.get(&place).await.expect(200).json();
+    let path = format!("{CALIBRATIONS}/{calibration}");
+    let shown = app.get(&path).await.expect(200).json();
     assert_eq!(shown["state"], "preparing", "the check is too short for this test");
     assert_eq!(app.checked(CALIBRATIONS, &calibration).await["state"], "ready");
     assert_eq!(id(&app.ask(CALIBRATIONS, &body, "k").await.expect(200)), calibration);
-    app.delete(&place).await.expect(204);
+    app.delete(&path).await.expect(204);
 
     // A deleted resource is not checked, and its key can be used again.
     let first = id(&app.ask(CALIBRATIONS, &body, "k").await.expect(202));
@@ -172,14 +172,14 @@ async fn a_check_survives_a_killed_server_but_not_its_deletion() {
 }
 
 #[tokio::test]
-async fn a_check_whose_workers_die_is_abandoned() {
+async fn a_check_is_abandoned_if_its_workers_die() {
     let app = TestApp::start().await;
     let masks = app.upload(large_masks()).await;
     let calibration = id(&app.ask(CALIBRATIONS, &json!({"masks": masks}), "k").await.expect(202));
-    let place = format!("{CALIBRATIONS}/{calibration}");
+    let path = format!("{CALIBRATIONS}/{calibration}");
     let mut killed = Vec::new();
     for _ in 0..10_000 {
-        let shown = app.get(&place).await.expect(200).json();
+        let shown = app.get(&path).await.expect(200).json();
         match shown["state"].as_str().unwrap() {
             "preparing" => {}
             "failed" => {
@@ -191,7 +191,7 @@ async fn a_check_whose_workers_die_is_abandoned() {
             }
             state => panic!("{state}: the check is too short for this test"),
         }
-        // Once it is at the check: it has the file open.
+        // A worker that performs the check has the file open.
         if let Some(worker) = app.light_worker()
             && reads(worker, &masks)
         {
@@ -224,7 +224,7 @@ async fn an_upload_is_checked_while_all_workers_are_busy_with_tiles() {
     let job = app.submit(&long).await;
     app.when(&job, |job| job["progress"]["tiles_running"] == 1).await;
     let before = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
-    // 1 MB.
+    // The masks have 1 MB.
     let body = json!({"masks": app.upload(constant(&[4, 256, 256], 1.0)).await});
     let start = std::time::Instant::now();
     app.post(CALIBRATIONS, &body).await.expect(201);
@@ -240,14 +240,14 @@ async fn an_upload_is_checked_while_all_workers_are_busy_with_tiles() {
 }
 
 #[tokio::test]
-async fn an_answer_is_all_that_is_left_of_a_refusal_in_time() {
+async fn a_refusal_within_the_request_leaves_no_resource() {
     let app = TestApp::start().await;
     let masks = app.upload(constant(&[4, 48, 64], 3.0)).await;
     let request = || {
         let request = app.request(Method::POST, CALIBRATIONS).json(&json!({"masks": masks}));
         app.send(request.header("Idempotency-Key", "k"))
     };
-    // Also of two with one key at a time.
+    // Two concurrent requests with one key get the same answer.
     let answers = futures_util::future::join_all([request(), request()]).await;
     for answer in answers {
         answer.problem(422, "invalid_content");

@@ -8,7 +8,7 @@ use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::app::{TestApp, has_programs, judges};
+use crate::app::{TestApp, has_programs, id, judges, training};
 use crate::resumable::cutting;
 use crate::samples::{Scene, constant};
 
@@ -92,20 +92,24 @@ async fn python_watches_a_folder() {
     assert!(!path("drop.npy.2.result").exists() && !path("small.npy.2.failed.txt").exists());
 }
 
-#[tokio::test]
-async fn the_notebook_runs_from_top_to_bottom() {
-    let Some(python) = judges() else { return };
-    let app = TestApp::with(&["--workers", "1"]).await;
+/// Runs a notebook of the Python client against a service, and returns the judge's report.
+async fn notebook(app: &TestApp, python: String, file: &str) -> Value {
     let mut notebook = tokio::process::Command::new(python);
     // A relative path would refer to the kernel's working folder.
     let clients = concat!(env!("CARGO_MANIFEST_DIR"), "/clients/python");
     notebook.env("PYTHONPATH", format!("{clients}/src"));
     notebook.env("SCI_RECON_URL", format!("http://{}", app.address()));
-    notebook.arg("tests/judges/run_notebook.py");
-    notebook.arg(format!("{clients}/examples/first_reconstruction.ipynb"));
+    notebook.arg("tests/judges/run_notebook.py").arg(format!("{clients}/examples/{file}"));
     let output = notebook.output().await.unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[tokio::test]
+async fn the_notebook_runs_from_top_to_bottom() {
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let report = notebook(&app, python, "first_reconstruction.ipynb").await;
     let text = report["printed"].as_str().unwrap();
     let jobs = app.get("/v1/jobs").await.expect(200).json();
     assert!(text.contains(jobs["items"][0]["id"].as_str().unwrap()), "{report}");
@@ -113,6 +117,36 @@ async fn the_notebook_runs_from_top_to_bottom() {
     assert!(psnr.parse::<f64>().unwrap() > 25.0, "{report}");
     let shown = report["kinds"].to_string();
     assert!(shown.contains("image/png") && shown.contains("text/html"), "{report}");
+}
+
+#[tokio::test]
+async fn deepinv_reconstructs_with_the_operator_of_a_calibration() {
+    let Some(python) = training() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let report = notebook(&app, python, "deepinv.ipynb").await;
+    let text = report["printed"].as_str().unwrap();
+    for name in ["sci-recon: ", "deepinv: "] {
+        let psnr = text.split(name).nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
+        assert!(psnr.parse::<f64>().unwrap() > 22.0, "{report}");
+    }
+    assert!(report["kinds"].to_string().contains("image/png"), "{report}");
+}
+
+#[tokio::test]
+async fn the_forward_model_of_the_python_client_is_right() {
+    let Some(python) = training() else { return };
+    let app = TestApp::start().await;
+    let folder = tempfile::tempdir().unwrap();
+    let (masks, file) = (Scene::SMALL.masks(), folder.path().join("masks.npy"));
+    std::fs::write(&file, &masks).unwrap();
+    let calibration = id(&app.calibrate(masks).await.expect(201));
+    let mut judge = tokio::process::Command::new(python);
+    judge.env("PYTHONPATH", "clients/python/src").arg("tests/judges/python_physics.py");
+    judge.arg(format!("http://{}", app.address())).arg(calibration).arg(file);
+    let output = judge.output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["ok"], true, "{report}");
 }
 
 #[tokio::test]

@@ -28,14 +28,14 @@ async fn a_repeated_request_creates_one_resource() {
     let data = app.upload(Scene::SMALL.snapshots()).await;
     let body = json!({ "masks": masks });
     let calibration = id(&with_key(&app, "/v1/calibrations", "k", &body).await.expect(201));
-    let again = with_key(&app, "/v1/calibrations", "k", &body).await.expect(200);
-    assert_eq!(id(&again), calibration);
-    assert_eq!(again.header("location"), format!("/v1/calibrations/{calibration}"));
+    let repeated = with_key(&app, "/v1/calibrations", "k", &body).await.expect(200);
+    assert_eq!(id(&repeated), calibration);
+    assert_eq!(repeated.header("location"), format!("/v1/calibrations/{calibration}"));
     let other = json!({ "masks": masks, "name": "another" });
     let refused = with_key(&app, "/v1/calibrations", "k", &other).await;
     let detail = refused.problem(422, "idempotency_key_reused");
     assert!(detail.contains(&calibration), "{detail}");
-    // The same key can be used for other kinds of resources.
+    // Each kind of resource has separate keys.
     let body = json!({ "calibration": calibration, "data": data });
     let answers = futures_util::future::join_all(
         (0..4).map(|_| with_key(&app, "/v1/measurements", "k", &body)),
@@ -124,13 +124,13 @@ async fn labels_names_and_priorities_can_be_changed() {
     let path = format!("/v1/jobs/{late}");
     let changed = patch(&app, &path, &json!({ "priority": 7 })).await.expect(200).json();
     assert_eq!((&changed["priority"], &changed["label"]), (&json!(7), &json!("first")));
-    let place = async |job: &str| {
+    let position = async |job: &str| {
         let job = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
         job["progress"]["queue_position"].clone()
     };
     // The forecast may be up to a second old.
     let start = Instant::now();
-    while (place(&late).await, place(&early).await) != (json!(1), json!(2)) {
+    while (position(&late).await, position(&early).await) != (json!(1), json!(2)) {
         assert!(
             start.elapsed() < Duration::from_secs(20),
             "the priority does not change the order"
@@ -175,7 +175,7 @@ async fn lists_are_filtered_by_state_and_date() {
     let cancel = format!("/v1/jobs/{}/cancel", first["id"].as_str().unwrap());
     app.post(&cancel, &json!({})).await.expect(202);
     let moment = second["created_at"].as_str().unwrap();
-    for (query, found) in [
+    for (query, expected) in [
         ("state=queued,cancelled".to_owned(), 2),
         ("state=queued,running".to_owned(), 1),
         ("state=failed,succeeded".to_owned(), 0),
@@ -184,7 +184,7 @@ async fn lists_are_filtered_by_state_and_date() {
         (format!("created_before={moment}&state=queued"), 0),
         ("created_after=2001-01-01T00:00:00Z".to_owned(), 2),
     ] {
-        assert_eq!(count(&app, &format!("/v1/jobs?{query}")).await, found, "{query}");
+        assert_eq!(count(&app, &format!("/v1/jobs?{query}")).await, expected, "{query}");
     }
     for list in ["calibrations", "measurements"] {
         assert_eq!(count(&app, &format!("/v1/{list}?created_before={moment}")).await, 1, "{list}");
@@ -277,12 +277,12 @@ async fn a_job_is_estimated_without_creating_it() {
 async fn a_sample_runs_without_uploads() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let body = json!({ "algorithm": "gap-tv", "label": "try" });
-    let made = with_key(&app, "/v1/samples", "k", &body).await.expect(201);
-    let sample = made.json();
+    let created = with_key(&app, "/v1/samples", "k", &body).await.expect(201);
+    let sample = created.json();
     let job = sample["job"]["id"].as_str().unwrap();
-    assert_eq!(made.header("location"), format!("/v1/jobs/{job}"));
-    let again = with_key(&app, "/v1/samples", "k", &body).await.expect(200).json();
-    assert_eq!(again["job"]["id"], job);
+    assert_eq!(created.header("location"), format!("/v1/jobs/{job}"));
+    let repeated = with_key(&app, "/v1/samples", "k", &body).await.expect(200).json();
+    assert_eq!(repeated["job"]["id"], job);
     assert_eq!(count(&app, "/v1/calibrations").await, 1);
     assert_eq!(count(&app, "/v1/measurements").await, 1);
     with_key(&app, "/v1/samples", "k", &json!({})).await.problem(422, "idempotency_key_reused");

@@ -57,8 +57,8 @@ impl Lab {
         Self::new(mosaic, |k, i, j| {
             let texture = 0.045 * ((i as f32 / 5.0).sin() + (j as f32 / 7.0).cos());
             let away = (i as f32 - 30.0).hypot(j as f32 - 14.0 - 3.0 * k as f32);
-            let of = if away < 13.0 { [0.8, 0.3, 0.1] } else { [0.15, 0.3, 0.6] };
-            of.map(|colour| colour + texture)
+            let rgb = if away < 13.0 { [0.8, 0.3, 0.1] } else { [0.15, 0.3, 0.6] };
+            rgb.map(|colour| colour + texture)
         })
     }
 
@@ -92,9 +92,9 @@ impl Lab {
     /// Creates a measurement with its calibration.
     async fn measure(&self, app: &TestApp, mosaic: &str) -> String {
         let calibration = id(&self.calibrate(app, mosaic).await.expect(201));
-        let made = app.measure(&calibration, self.file("measurement.npy")).await.expect(201);
-        assert_eq!(made.json()["warnings"], json!([]), "a stated mosaic gives no warning");
-        id(&made)
+        let created = app.measure(&calibration, self.file("measurement.npy")).await.expect(201);
+        assert_eq!(created.json()["warnings"], json!([]), "a stated mosaic gives no warning");
+        id(&created)
     }
 }
 
@@ -136,11 +136,11 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     assert_eq!(calibration["mosaic"], "grbg");
     let base = format!("/v1/jobs/{job}/snapshots/1");
 
-    // At each of four places, there is one tile per sub-image.
+    // At each of four positions, there is one tile per sub-image.
     let tiles = app.get(&format!("{base}/tiles")).await.expect(200).json();
     let places = tiles["items"].as_array().unwrap().iter().map(|tile| {
-        let of = |name: &str| tile[name].as_u64().unwrap();
-        (of("row"), of("column"), of("height"), of("width"), of("plane"))
+        let field = |name: &str| tile[name].as_u64().unwrap();
+        (field("row"), field("column"), field("height"), field("width"), field("plane"))
     });
     let expected = [0, 16].into_iter().flat_map(|row| [0, 16].map(|column| (row, column)));
     let expected =
@@ -155,9 +155,9 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     let colours = values(&lab.file("truth.npy"));
     let green = [[1, 0], [2, 1]];
     let at = |at: usize| 3 * at + green[at / SIDE % 2][at % 2];
-    let seen = (0..colours.len() / 3).map(|pixel| colours[at(pixel)]);
-    let seen = app.upload(npy(&[SNAPSHOTS * FRAMES, SIDE, SIDE], seen)).await;
-    let quality = app.get(&format!("{base}/quality?truth={seen}")).await.expect(200).json();
+    let raw = (0..colours.len() / 3).map(|pixel| colours[at(pixel)]);
+    let raw = app.upload(npy(&[SNAPSHOTS * FRAMES, SIDE, SIDE], raw)).await;
+    let quality = app.get(&format!("{base}/quality?truth={raw}")).await.expect(200).json();
     assert!((quality["psnr"].as_f64().unwrap() - psnr).abs() < 3.0, "{quality}");
     let grey = app.upload(npy(&[4, 64, 32, 3], std::iter::repeat_n(0.5, 4 * 64 * 32 * 3))).await;
     let refused = app.get(&format!("{base}/quality?truth={grey}")).await;
@@ -209,7 +209,7 @@ async fn a_mosaic_is_reconstructed_in_colour() {
 #[tokio::test]
 async fn workers_and_the_command_line_give_the_same_colours() {
     let lab = Lab::coloured("rggb");
-    // Both snapshots jointly, with a pilot.
+    // The job solves both snapshots jointly, with a pilot.
     let job = |measurement: &str| {
         let mut job = tv(measurement);
         job["algorithm"] = json!("gap-tv3d");
@@ -224,10 +224,10 @@ async fn workers_and_the_command_line_give_the_same_colours() {
     };
     let app = TestApp::with(&["--workers", "2"]).await;
     let (id, ended) = run(&app).await;
-    // Four places with four sub-images each, in one run of both snapshots.
+    // The plan has four positions with four sub-images each, in one run of both snapshots.
     assert_eq!(ended["progress"]["tiles_total"], 16, "{ended:#}");
     let expected = results_of(&app, &id, SNAPSHOTS).await;
-    // Frames, images, stack, array and mosaic of each snapshot.
+    // Each snapshot has frames, images, stack, array and mosaic.
     assert_eq!(expected.len(), SNAPSHOTS * (2 * FRAMES + 3));
 
     let line = [
@@ -325,9 +325,9 @@ async fn an_invalid_mosaic_is_rejected_and_captures_can_have_one() {
     let captures = json!({"masks": masks, "white": send(&index["white"]).await,
         "black": send(&index["black"]).await});
     let body = json!({"captures": captures, "mosaic": "gbrg"});
-    let made = app.post("/v1/calibrations", &body).await.expect(202).json();
-    assert_eq!(made["mosaic"], "gbrg");
-    let path = format!("/v1/calibrations/{}", made["id"].as_str().unwrap());
+    let created = app.post("/v1/calibrations", &body).await.expect(202).json();
+    assert_eq!(created["mosaic"], "gbrg");
+    let path = format!("/v1/calibrations/{}", created["id"].as_str().unwrap());
     let ready = async || app.get(&path).await.expect(200).json();
     while ready().await["state"] == "preparing" {
         tokio::time::sleep(std::time::Duration::from_millis(20)).await;

@@ -73,10 +73,10 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     lab.write("shots.npy", &scene.snapshots());
     let submit = ["submit", "shots.npy", "--masks", "masks.npy", "--algorithm", "gap-tv"];
     let job = lab.text(&[&submit[..], &["--label", "first", "--key", "k"]].concat()).await;
-    // The same submission is the same job with the same calibration.
-    let again =
+    // A repeated submission returns the same job and calibration.
+    let repeated =
         lab.json(&[&submit[..], &["--label", "first", "--key", "k", "--json"]].concat()).await;
-    assert_eq!((&again["id"], &again["label"]), (&json!(job), &json!("first")));
+    assert_eq!((&repeated["id"], &repeated["label"]), (&json!(job), &json!("first")));
     let calibrations = app.get("/v1/calibrations").await.expect(200).json();
     assert_eq!(calibrations["items"].as_array().unwrap().len(), 1);
 
@@ -100,14 +100,14 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
         "sequence.npy",
         "sequence.mp4",
     ] {
-        let (place, name) = file.split_once('/').unwrap_or(("", file));
-        let path = match (place, name) {
+        let (subfolder, name) = file.split_once('/').unwrap_or(("", file));
+        let path = match (subfolder, name) {
             ("", "sequence.npy") => "sequence/frames.npy".to_owned(),
             ("", _) => "sequence/movie.mp4".to_owned(),
             _ => {
                 let name = name.replace("png/frame_0003", "frames/3");
                 let name = name.replace("stack-sigma.exr", "stack.exr?layers=sigma");
-                format!("snapshots/{}/{name}", &place[12..])
+                format!("snapshots/{}/{name}", &subfolder[12..])
             }
         };
         let served = app.get(&format!("/v1/jobs/{job}/{path}")).await.expect(200).bytes;
@@ -121,7 +121,7 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     lab.text(&["fetch", &job, "--out", "out"]).await;
     lab.write("out/snapshot_0000/frames.npy", b"mine");
     let refused = lab.refused(2, &["fetch", &job, "--out", "out"]).await;
-    assert!(refused.contains("nothing is overwritten"), "{refused}");
+    assert!(refused.contains("it is not overwritten"), "{refused}");
     assert_eq!(std::fs::read(lab.path("out/snapshot_0000/frames.npy")).unwrap(), b"mine");
 
     let listed = lab.json(&["ls", "--json", "--state", "succeeded"]).await;
@@ -134,16 +134,16 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
 
 /// Partial files.
 fn parts(folder: &Path) -> Vec<std::path::PathBuf> {
-    let mut found = Vec::new();
+    let mut paths = Vec::new();
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
         if path.is_dir() {
-            found.extend(parts(&path));
+            paths.extend(parts(&path));
         } else if path.extension().is_some_and(|ending| ending == "part") {
-            found.push(path);
+            paths.push(path);
         }
     }
-    found
+    paths
 }
 
 #[tokio::test]
@@ -166,9 +166,9 @@ async fn rejections_name_the_reason_and_the_place() {
         (vec!["submit", "shots.npy", "--url", "ftp://here"], "http://"),
         (vec!["submit", "shots.npy", "--token", "wrong"], "unauthorized"),
     ] {
-        let whole =
+        let arguments =
             if words == "--calibration" { line.clone() } else { [&line[..], &masks].concat() };
-        let output = lab.run(&whole).await;
+        let output = lab.run(&arguments).await;
         let text = String::from_utf8_lossy(&output.stderr);
         assert!(!output.status.success() && text.contains(words), "{line:?}: {text}");
     }
@@ -191,17 +191,19 @@ async fn rejections_name_the_reason_and_the_place() {
     assert!(String::from_utf8_lossy(&output.stdout).contains(&job), "{output:?}");
 }
 
-/// A server with a self-signed certificate that answers everything with 404; its address, and the certificate as PEM.
+/// Starts a server with a self-signed certificate that answers every request with 404. Returns its address, and the
+/// certificate as PEM.
 fn tls_server() -> (String, String) {
     let names = vec!["localhost".to_owned(), "127.0.0.1".to_owned()];
-    let made = rcgen::generate_simple_self_signed(names).unwrap();
-    let key = rustls::pki_types::PrivateKeyDer::try_from(made.signing_key.serialize_der()).unwrap();
+    let certified = rcgen::generate_simple_self_signed(names).unwrap();
+    let key =
+        rustls::pki_types::PrivateKeyDer::try_from(certified.signing_key.serialize_der()).unwrap();
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = rustls::ServerConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .unwrap()
         .with_no_client_auth()
-        .with_single_cert(vec![made.cert.der().clone()], key)
+        .with_single_cert(vec![certified.cert.der().clone()], key)
         .unwrap();
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("https://{}", listener.local_addr().unwrap());
@@ -218,11 +220,11 @@ fn tls_server() -> (String, String) {
             }
         }
     });
-    (url, made.cert.pem())
+    (url, certified.cert.pem())
 }
 
 #[tokio::test]
-async fn lasting_failures_end_a_command_at_once_and_others_are_announced() {
+async fn permanent_failures_end_a_command_at_once_and_others_are_retried() {
     let (url, certificate) = tls_server();
     let lab = Lab::new(url.clone(), "token");
     lab.write("authority.pem", certificate.as_bytes());
@@ -231,14 +233,14 @@ async fn lasting_failures_end_a_command_at_once_and_others_are_announced() {
     for (url, words) in [
         (url.as_str(), "SSL_CERT_FILE"),
         (&format!("https://{}", app.address()), "http:// instead of https://"),
-        // Too long for a host name: no resolver is asked.
+        // The host name is too long for the resolver, so that none is needed.
         (&format!("http://{}.lab", "b".repeat(70)), "correct the host name"),
     ] {
         let refused = lab.refused(2, &["ls", "--url", url]).await;
         assert!(refused.contains(words) && refused.contains(url), "{refused}");
     }
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
-    // With the certificate of its authority the service is spoken to.
+    // The client accepts the service with the certificate of its authority.
     let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     command.args(["ls", "--url", &url]).env("SSL_CERT_FILE", lab.path("authority.pem"));
     let output = command.output().await.unwrap();
@@ -251,15 +253,15 @@ async fn lasting_failures_end_a_command_at_once_and_others_are_announced() {
         command.stderr(std::process::Stdio::piped()).kill_on_drop(true).spawn().unwrap();
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
     let line = tokio::time::timeout(Duration::from_secs(10), lines.next_line()).await;
-    let line = line.expect("it says so at the first try").unwrap().unwrap();
+    let line = line.expect("the first failure is announced").unwrap().unwrap();
     assert!(line.contains("refused") && line.contains("trying again"), "{line}");
-    assert!(child.try_wait().unwrap().is_none(), "it tries again");
+    assert!(child.try_wait().unwrap().is_none(), "the command tries again");
 }
 
-/// Large enough for the checks.
+/// A scene that is large enough for the checks.
 const SCENE: Scene = Scene { frames: 4, height: 128, width: 128, snapshots: 1 };
 
-/// Masks that are submitted as snapshots by mistake.
+/// Submits masks as snapshots, as a mistake of a user.
 #[tokio::test]
 async fn findings_are_printed_by_every_command_with_their_remedies() {
     let app = TestApp::with(&["--workers", "1"]).await;
@@ -268,11 +270,11 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     lab.write("oops.npy", &SCENE.masks());
     let masks = ["--masks", "masks.npy", "--algorithm", "gap-tv"];
     let submitted = lab.run(&[&["submit", "oops.npy"][..], &masks].concat()).await;
-    let told = String::from_utf8(submitted.stderr).unwrap();
-    assert_eq!(submitted.status.code(), Some(3), "{told}");
-    let errors = told.lines().filter(|line| line.starts_with("error ")).count();
-    assert!(errors > 0 && told.matches("Remedy: ").count() >= errors, "{told}");
-    assert!(told.contains("the checks found"), "{told}");
+    let stderr = String::from_utf8(submitted.stderr).unwrap();
+    assert_eq!(submitted.status.code(), Some(3), "{stderr}");
+    let errors = stderr.lines().filter(|line| line.starts_with("error ")).count();
+    assert!(errors > 0 && stderr.matches("Remedy: ").count() >= errors, "{stderr}");
+    assert!(stderr.contains("the checks found"), "{stderr}");
     let job = String::from_utf8(submitted.stdout).unwrap().trim().to_owned();
 
     let watched = lab.run(&["watch", &job]).await;
@@ -301,7 +303,7 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     assert!(report.starts_with("oops.npy: bad") && report.contains("\nerror "), "{report}");
     assert!(report.contains("Remedy: "), "{report}");
 
-    // Without a server the checks find the same.
+    // The offline command has the same findings.
     let watched = lab.run(&["watch", &job, "--json"]).await;
     let online: Value = serde_json::from_slice(&watched.stdout).unwrap();
     let line = ["reconstruct", "--masks", "masks.npy", "--measurement", "oops.npy"];
@@ -335,21 +337,21 @@ async fn a_dark_is_subtracted_by_submit_and_without_a_server() {
     let reconstruct = [&reconstruct[..], &["--algorithm", "gap-tv", "--json"]].concat();
     for (more, is_dark) in [(&[][..], false), (&dark[..], true)] {
         let output = lab.run(&[&submit[..], more].concat()).await;
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(told.contains("no_dark"), !is_dark, "{told}");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(stderr.contains("no_dark"), !is_dark, "{stderr}");
         let job = String::from_utf8(output.stdout).unwrap().trim().to_owned();
         let job = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
-        let place = format!("/v1/measurements/{}", job["measurement"].as_str().unwrap());
-        let measurement = app.get(&place).await.expect(200).json();
+        let path = format!("/v1/measurements/{}", job["measurement"].as_str().unwrap());
+        let measurement = app.get(&path).await.expect(200).json();
         assert_eq!(measurement["name"], "drop");
         assert_eq!(measurement["dark"].as_array().unwrap().len(), if is_dark { 2 } else { 0 });
         let output = lab.run(&[&reconstruct[..], more].concat()).await;
-        let told = String::from_utf8_lossy(&output.stdout);
-        assert_eq!(told.contains("no_dark"), !is_dark, "{told}");
+        let stdout = String::from_utf8_lossy(&output.stdout);
+        assert_eq!(stdout.contains("no_dark"), !is_dark, "{stdout}");
     }
 }
 
-/// Arrays of other names, in files that other programs have written.
+/// Reads arrays with unusual names from files of other programs.
 #[tokio::test]
 async fn arrays_can_have_any_name() {
     let app = TestApp::start().await;
@@ -374,7 +376,7 @@ async fn arrays_can_have_any_name() {
     assert!(refused.contains("omit `array`"), "{refused}");
 }
 
-/// 50 files, two of them equal, while the watcher is killed again and again.
+/// Adds 50 files, two of them equal, while the watcher is killed repeatedly.
 #[tokio::test]
 async fn a_watched_folder_submits_each_file_once_despite_kills() {
     let app = TestApp::with(&["--workers", "2"]).await;
@@ -407,7 +409,7 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
     for kill in 0..10 {
         let mut watcher = start(false);
         for number in kill * 5..kill * 5 + 5 {
-            // Like camera software, it writes the file in pieces under its final name.
+            // Camera software writes a file in pieces under its final name.
             let (path, bytes) = (bench.join(format!("shot_{number:02}.npy")), shot(number));
             std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;

@@ -36,8 +36,8 @@ async fn if_match_makes_a_request_conditional() {
     // HEAD has no ranges (RFC 9110, 14.2).
     let head = app.request(Method::HEAD, &frames).header("range", "bytes=0-9");
     let head = app.send(head).await.expect(200);
-    let whole = app.get(&frames).await.expect(200).bytes.len();
-    assert_eq!(head.header("content-length"), whole.to_string());
+    let length = app.get(&frames).await.expect(200).bytes.len();
+    assert_eq!(head.header("content-length"), length.to_string());
     let part = app.request(Method::GET, &frames).header("range", "bytes=0-9");
     assert_eq!(app.send(part).await.expect(206).bytes.len(), 10);
 }
@@ -134,10 +134,10 @@ async fn readiness_is_tested_by_writing() {
     let mut records = SqliteConnection::connect_with(&options).await.unwrap();
     sqlx::query("VACUUM").execute(&mut records).await.unwrap();
     records.close().await.unwrap();
-    let whole = std::fs::read(&path).unwrap();
-    let mut found = false;
-    for page in (whole.len() / 8192..whole.len() / 4096).rev().step_by(3) {
-        let mut bytes = whole.clone();
+    let original = std::fs::read(&path).unwrap();
+    let mut is_found = false;
+    for page in (original.len() / 8192..original.len() / 4096).rev().step_by(3) {
+        let mut bytes = original.clone();
         bytes[page * 4096..page * 4096 + 64].fill(0xa5);
         std::fs::write(&path, bytes).unwrap();
         if !app.try_restart() {
@@ -152,10 +152,10 @@ async fn readiness_is_tested_by_writing() {
             tokio::time::sleep(Duration::from_millis(100)).await;
         };
         assert!(health != "ok", "page {page} is damaged, and the database is {health}");
-        found = true;
+        is_found = true;
         app.kill();
     }
-    assert!(found, "the service starts with no damage at all");
+    assert!(is_found, "the service starts with no damage at all");
 }
 
 #[tokio::test]
@@ -177,8 +177,8 @@ async fn a_corrected_clock_deletes_no_recent_upload() {
     tokio::time::sleep(Duration::from_secs(2)).await;
     app.get(&format!("/v1/blobs/{upload}")).await.expect(200);
     app.get(&format!("/v1/jobs/{job}")).await.expect(200);
-    let place = created.header("location").to_owned();
-    let head = app.request(Method::HEAD, &place).header("tus-resumable", "1.0.0");
+    let path = created.header("location").to_owned();
+    let head = app.request(Method::HEAD, &path).header("tus-resumable", "1.0.0");
     app.send(head).await.expect(200);
 }
 

@@ -13,7 +13,7 @@ static CONTRACT: LazyLock<Value> = LazyLock::new(|| {
     serde_yaml_ng::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
 });
 
-/// The value that a reference points to; the value itself if it is no reference.
+/// Follows a reference. Returns any other value unchanged.
 fn resolve(value: &Value) -> &Value {
     match value["$ref"].as_str() {
         Some(place) => CONTRACT.pointer(place.trim_start_matches('#')).unwrap(),
@@ -24,12 +24,15 @@ fn resolve(value: &Value) -> &Value {
 /// Fails unless the contract has this answer: its status, the error code under that status, and the
 /// required fields.
 #[track_caller]
-pub fn hold(method: &Method, path: &str, answer: &Answer) {
+pub fn check(method: &Method, path: &str, answer: &Answer) {
     let Some(operation) = operation(method, path) else { return };
     let status = answer.status.as_str();
     let documented = resolve(&operation["responses"][status]);
     let text = String::from_utf8_lossy(&answer.bytes);
-    assert!(!documented.is_null(), "{method} {path}: no {status} in the contract; it said {text}");
+    assert!(
+        !documented.is_null(),
+        "{method} {path}: no {status} in the contract; the answer was {text}"
+    );
     let kind = answer.header("content-type").split(';').next().unwrap_or_default();
     let (false, "application/json" | "application/problem+json") = (answer.bytes.is_empty(), kind)
     else {
@@ -39,8 +42,8 @@ pub fn hold(method: &Method, path: &str, answer: &Answer) {
     assert!(!schema.is_null(), "{method} {path}: no {kind} for {status} in the contract");
     let body = answer.json();
     for field in schema["required"].as_array().into_iter().flatten() {
-        let there = body.get(field.as_str().unwrap()).is_some();
-        assert!(there, "{method} {path}: no field {field} in {text}");
+        let is_present = body.get(field.as_str().unwrap()).is_some();
+        assert!(is_present, "{method} {path}: no field {field} in {text}");
     }
     for field in body.as_object().into_iter().flat_map(|body| body.keys()) {
         let known = schema["properties"].get(field).is_some() || schema["properties"].is_null();
@@ -53,7 +56,7 @@ pub fn hold(method: &Method, path: &str, answer: &Answer) {
     }
 }
 
-/// The operation of the contract, or none for an unknown path or method.
+/// The operation of the contract. `None` for an unknown path or method.
 fn operation<'a>(method: &Method, path: &str) -> Option<&'a Value> {
     let name = method.as_str().to_ascii_lowercase();
     let fits = |template: &str| {
@@ -79,8 +82,8 @@ async fn the_contract_is_served_and_its_references_resolve() {
     let text = String::from_utf8(answer.bytes).unwrap();
     for reference in text.split("$ref: \"#/").skip(1) {
         let path = reference.split('"').next().unwrap();
-        let found = path.split('/').fold(&contract, |at, key| &at[key]);
-        assert!(!found.is_null(), "{path} leads nowhere");
+        let value = path.split('/').fold(&contract, |at, key| &at[key]);
+        assert!(!value.is_null(), "{path} leads nowhere");
     }
 }
 
@@ -89,8 +92,8 @@ async fn every_error_type_has_a_page() {
     let app = TestApp::start().await;
     let refused = app.post("/v1/jobs", &json!({})).await;
     refused.problem(422, "invalid_request");
-    let place = refused.json()["type"].as_str().unwrap().to_owned();
-    let page = app.get(&place).await.expect(200);
+    let path = refused.json()["type"].as_str().unwrap().to_owned();
+    let page = app.get(&path).await.expect(200);
     assert!(page.header("content-type").starts_with("text/html"));
     assert!(page.header("content-security-policy").contains("default-src 'none'"));
     assert!(String::from_utf8_lossy(&page.bytes).contains("invalid_request"));
@@ -157,7 +160,7 @@ async fn metrics_count_requests_and_resources() {
         "sci_recon_jobs{state=\"queued\"} 0",
         "sci_recon_workers 0",
     ] {
-        assert!(text.lines().any(|found| found == line), "no {line} in\n{text}");
+        assert!(text.lines().any(|text_line| text_line == line), "no {line} in\n{text}");
     }
 }
 

@@ -22,15 +22,15 @@ fn quick(measurement: &str) -> Value {
     })
 }
 
-/// Flips a bit in the middle of a file. If `seen`, the time of the last change shows it.
-fn flip_a_bit(path: &Path, seen: bool) {
+/// Flips a bit in the middle of a file. The modification time changes only if `is_visible`.
+fn flip_a_bit(path: &Path, is_visible: bool) {
     use std::os::unix::fs::FileExt;
     let file = std::fs::File::options().read(true).write(true).open(path).unwrap();
     let meta = file.metadata().unwrap();
     let (mut byte, middle) = ([0], meta.len() / 2);
     file.read_exact_at(&mut byte, middle).unwrap();
     file.write_all_at(&[byte[0] ^ 0x10], middle).unwrap();
-    if !seen {
+    if !is_visible {
         file.set_modified(meta.modified().unwrap()).unwrap();
     }
 }
@@ -133,8 +133,8 @@ async fn a_damaged_result_is_not_served_and_is_computed_again() {
                            (SELECT coalesce(sum(size), 0) FROM result_files)";
         sqlx::query_as(sums).fetch_one(&mut database).await.unwrap()
     };
-    let (charged, there) = sums().await;
-    assert!(charged == there && there > 0, "{charged} {there}");
+    let (charged, stored) = sums().await;
+    assert!(charged == stored && stored > 0, "{charged} {stored}");
     app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
     assert_eq!(sums().await, (0, 0));
 }
@@ -163,8 +163,8 @@ async fn the_periodic_check_finds_silent_damage() {
     flip_a_bit(&frames_of(&app, &job), false);
     let start = Instant::now();
     loop {
-        let again = "UPDATE scrub SET started_at = started_at - 86400001, place = NULL";
-        sqlx::query(again).execute(&mut database).await.unwrap();
+        let overdue = "UPDATE scrub SET started_at = started_at - 86400001, place = NULL";
+        sqlx::query(overdue).execute(&mut database).await.unwrap();
         tokio::time::sleep(Duration::from_secs(1)).await;
         let figures = app.get("/metrics").await.expect(200).bytes;
         if String::from_utf8(figures).unwrap().contains("\nsci_recon_damaged_files 1\n") {
@@ -186,7 +186,7 @@ async fn backup_and_verify_name_missing_files() {
         let out = folder.path().join(name);
         figures(&command("backup", app.data()).arg("--out").arg(&out).output().unwrap())
     };
-    // By a name without a folder.
+    // The name of the copy may lack a folder.
     let mut bare = command("backup", &std::path::absolute(app.data()).unwrap());
     let bare = bare.args(["--out", "bare"]).current_dir(folder.path()).output().unwrap();
     assert!(figures(&bare).0, "{bare:?}");
@@ -198,11 +198,11 @@ async fn backup_and_verify_name_missing_files() {
     std::fs::remove_file(app.data().join(&blob)).unwrap();
     std::fs::remove_file(frames_of(&app, &job)).unwrap();
     let frames = format!("results/{job}/snapshot_0000/frames.npy");
-    for (good, found) in [back_up("less"), verify(app.data()), verify(&folder.path().join("less"))]
-    {
-        assert!(!good);
-        assert_eq!(found["missing"], json!([blob, frames]), "{found}");
-        assert_eq!(found["damaged"], json!([]), "{found}");
+    let reports = [back_up("less"), verify(app.data()), verify(&folder.path().join("less"))];
+    for (is_good, report) in reports {
+        assert!(!is_good);
+        assert_eq!(report["missing"], json!([blob, frames]), "{report}");
+        assert_eq!(report["damaged"], json!([]), "{report}");
     }
     // A copy is verified in the same way.
     let copied = folder.path().join("whole").join(&blob);
@@ -251,7 +251,7 @@ async fn an_interrupted_copy_cannot_be_served() {
 }
 
 #[tokio::test]
-async fn a_copy_killed_while_it_removes_an_earlier_one_blocks_no_later_one() {
+async fn a_copy_killed_during_cleanup_blocks_no_later_copy() {
     let shim = Shim::build();
     let app = TestApp::with(&["--workers", "0"]).await;
     for number in 0..10u32 {
@@ -260,7 +260,7 @@ async fn a_copy_killed_while_it_removes_an_earlier_one_blocks_no_later_one() {
     let folder = tempfile::tempdir().unwrap();
     let (out, unfinished) = (folder.path().join("copy"), folder.path().join("copy.unfinished"));
     let kill = |at| disturbed(&shim, app.data(), &out, "kill", at).output().unwrap();
-    // One that has come far is left by a kill, and the next is killed earlier, while it removes that.
+    // The first copy is killed late and leaves many entries. The next one is killed earlier, while it removes them.
     let far = (40..400).step_by(10).find(|at| {
         kill(*at);
         entries(&unfinished) > 12
@@ -272,12 +272,12 @@ async fn a_copy_killed_while_it_removes_an_earlier_one_blocks_no_later_one() {
         }
         let before = entries(&unfinished);
         kill(at);
-        let left = entries(&unfinished);
-        removing += u32::from(left > 0 && left < before);
+        let remaining = entries(&unfinished);
+        removing += u32::from(remaining > 0 && remaining < before);
         let is_marked = unfinished.join("sci-recon.json").exists();
         assert!(
-            is_marked || left == 0,
-            "killed at operation {at}: {left} of {before} entries are left"
+            is_marked || remaining == 0,
+            "killed at operation {at}: {remaining} of {before} entries remain"
         );
     }
     assert!(removing >= 5, "{removing} were killed while they removed files");
@@ -287,8 +287,8 @@ async fn a_copy_killed_while_it_removes_an_earlier_one_blocks_no_later_one() {
 
 /// Number of files and folders below a folder.
 fn entries(folder: &Path) -> usize {
-    let found = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    found.map(|entry| 1 + entries(&entry.path())).sum()
+    let children = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    children.map(|entry| 1 + entries(&entry.path())).sum()
 }
 
 struct Suspended(Child);

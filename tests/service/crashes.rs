@@ -99,10 +99,10 @@ async fn attempt(app: &TestApp) -> Option<String> {
     let job = post("/v1/jobs", small(&measurement)).await?;
     loop {
         let request = app.request(reqwest::Method::GET, &format!("/v1/jobs/{job}"));
-        let found: Value = request.send().await.ok()?.error_for_status().ok()?.json().await.ok()?;
-        match found["state"].as_str()? {
+        let shown: Value = request.send().await.ok()?.error_for_status().ok()?.json().await.ok()?;
+        match shown["state"].as_str()? {
             "succeeded" => return Some(job),
-            "failed" => panic!("{found:#}"),
+            "failed" => panic!("{shown:#}"),
             _ => tokio::time::sleep(Duration::from_millis(20)).await,
         }
     }
@@ -167,12 +167,12 @@ async fn a_full_disk_does_no_permanent_harm() {
     let fill = || std::fs::write(&full, "").unwrap();
     let free = || std::fs::remove_file(&full).unwrap();
     let upload = |bytes| app.send(app.request(reqwest::Method::POST, "/v1/blobs").body(bytes));
-    // During an upload.
+    // The disk fills during an upload.
     fill();
     upload(Scene::SMALL.masks()).await.problem(507, "insufficient_storage");
     free();
     let masks = upload(Scene::SMALL.masks()).await.expect(201).json()["sha256"].clone();
-    // During the preparation of masks.
+    // The disk fills during the preparation of masks.
     fill();
     let refused = app.post("/v1/calibrations", &json!({ "masks": masks })).await;
     refused.problem(507, "insufficient_storage");
@@ -180,11 +180,11 @@ async fn a_full_disk_does_no_permanent_harm() {
     let calibration =
         id(&app.post("/v1/calibrations", &json!({ "masks": masks })).await.expect(201));
     let measurement = id(&app.measure(&calibration, Scene::SMALL.snapshots()).await.expect(201));
-    // During the submission of a job.
+    // The disk fills during the submission of a job.
     fill();
     app.post("/v1/jobs", &small(&measurement)).await.problem(507, "insufficient_storage");
     free();
-    // During a job: a failed job can be retried when there is space.
+    // The disk fills during a job. A failed job can be retried when there is space.
     let job = app.submit(&small(&measurement)).await;
     fill();
     tokio::time::sleep(Duration::from_millis(1500)).await;
@@ -203,6 +203,82 @@ async fn a_full_disk_does_no_permanent_harm() {
     }
     assert_eq!(done["state"], "succeeded", "{done:#}");
     assert_eq!(results(&app, &job).await, undisturbed().await);
+}
+
+#[tokio::test]
+async fn a_job_waits_while_the_file_system_is_read_only() {
+    let shim = Shim::build();
+    let readonly = shim.file("readonly");
+    let faults = [("FAULT_READONLY", readonly.to_str().unwrap())];
+    let app = shim.service(&["--workers", "1"], &faults).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let mut body = small(&measurement);
+    body["schedule"]["stages"][0]["iterations"] = json!(3000);
+    let job = app.submit(&body).await;
+    app.when(&job, |job| job["state"] != "queued").await;
+    std::fs::write(&readonly, "").unwrap();
+    let upload = app.request(reqwest::Method::POST, "/v1/blobs").body("abc");
+    let detail = app.send(upload).await.problem(503, "unavailable");
+    assert!(detail.contains("read-only"), "{detail}");
+    app.post("/v1/jobs", &body).await.problem(503, "unavailable");
+    // The time is longer than three attempts take.
+    tokio::time::sleep(Duration::from_secs(12)).await;
+    let state = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json()["state"].clone();
+    assert!(state == "running" || state == "queued", "{state}");
+    std::fs::remove_file(&readonly).unwrap();
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    app.upload(b"abc".to_vec()).await;
+}
+
+/// A small file system in memory.
+struct SmallDisk(tempfile::TempDir);
+
+impl SmallDisk {
+    /// `None` where file systems can't be mounted.
+    fn mount(size: &str) -> Option<Self> {
+        let folder = tempfile::tempdir().unwrap();
+        let mut mount = Command::new("mount");
+        mount.args(["-t", "tmpfs", "-o", size, "tmpfs"]).arg(folder.path());
+        mount.output().is_ok_and(|output| output.status.success()).then_some(Self(folder))
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("--lazy").arg(self.0.path()).status();
+    }
+}
+
+#[tokio::test]
+async fn a_service_starts_on_a_full_disk_and_deletes() {
+    use std::io::Write;
+    let Some(disk) = SmallDisk::mount("size=160m") else {
+        return crate::app::skip("a file system can't be mounted: run the test as root");
+    };
+    let folder = tempfile::tempdir_in(disk.0.path()).unwrap();
+    let filling = disk.0.path().join("filling");
+    let mut app = TestApp::on(folder, "data", &["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&small(&measurement)).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let reserve = app.data().join("reserve");
+    let start = std::time::Instant::now();
+    while !reserve.exists() {
+        assert!(start.elapsed().as_secs() < 30, "no reserve is made");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    app.kill();
+    let mut file = std::fs::File::create(&filling).unwrap();
+    while file.write_all(&[1; 4096]).is_ok() {}
+    drop(file);
+    assert!(app.try_restart(), "the service starts");
+    assert!(!reserve.exists());
+    app.delete(&format!("/v1/jobs/{job}")).await.expect(204);
+    app.get(&format!("/v1/jobs/{job}")).await.problem(404, "not_found");
+    std::fs::remove_file(&filling).unwrap();
+    app.upload(b"abc".to_vec()).await;
+    drop(app);
 }
 
 #[tokio::test]

@@ -192,7 +192,7 @@ async fn a_nearly_full_disk_removes_the_oldest_unneeded_jobs() {
     for path in [format!("jobs/{new}"), format!("jobs/{waiting}")] {
         app.get(&format!("/v1/{path}")).await.expect(200);
     }
-    let found = app.get(&format!("/v1/calibrations/{calibration}")).await.expect(200).json();
-    app.get(&format!("/v1/blobs/{}", found["masks"].as_str().unwrap())).await.expect(200);
+    let shown = app.get(&format!("/v1/calibrations/{calibration}")).await.expect(200).json();
+    app.get(&format!("/v1/blobs/{}", shown["masks"].as_str().unwrap())).await.expect(200);
     assert_eq!(app.blobs().len(), 4);
 }

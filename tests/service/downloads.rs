@@ -77,14 +77,14 @@ impl Reader {
 
 /// Lets `readers` clients of one lab download at 4 kB/s for `time`, while another lab sends a request every 20 ms.
 /// Returns the status and the duration of each answer to the other lab.
-pub async fn ask_beside_slow_readers(
+pub async fn ask_during_slow_downloads(
     readers: usize,
     time: Duration,
 ) -> Vec<(StatusCode, Duration)> {
     let app = TestApp::with(&["--workers", "0"]).await;
     let (a, b) = (app.token(&["create", "--lab", "a"]), app.token(&["create", "--lab", "b"]));
     app.sign_in(&a);
-    // Larger than the buffers of a connection.
+    // The file is larger than the buffers of a connection.
     let sha256 = app.upload(vec![3; 40_000_000]).await;
     app.sign_in(&b);
     let path = format!("/v1/blobs/{sha256}/content");
@@ -118,7 +118,7 @@ pub async fn ask_beside_slow_readers(
 
 #[tokio::test]
 async fn slow_clients_do_not_block_others() {
-    let answers = ask_beside_slow_readers(200, Duration::from_secs(14)).await;
+    let answers = ask_during_slow_downloads(200, Duration::from_secs(14)).await;
     assert!(answers.len() > 20, "{}", answers.len());
     for (status, took) in answers {
         assert_eq!(status, 200);
@@ -235,7 +235,7 @@ async fn a_file_on_a_slow_disk_is_read_once_without_time_limit() {
     tokio::time::sleep(Duration::from_secs(7)).await;
     let took = head(&content).await;
     assert!(took < 3.0, "the file is read again: {took} s");
-    // Every route that reads a whole file before the first byte.
+    // These routes read a whole file before they send the first byte.
     forget();
     let snapshot = format!("/v1/jobs/{job}/snapshots/0");
     let paths = [

@@ -62,8 +62,8 @@ async fn exports_support_caching_and_ranges_like_files() {
     }
     for path in paths.iter().chain(&zarr[1..]).chain(&["snapshots/1/stack.tif"]) {
         let path = format!("/v1/jobs/{job}/{path}");
-        let whole = app.get(&path).await.expect(200);
-        let (size, etag) = (whole.bytes.len(), whole.header("etag").to_owned());
+        let complete = app.get(&path).await.expect(200);
+        let (size, etag) = (complete.bytes.len(), complete.header("etag").to_owned());
         let head = app.send(app.request(Method::HEAD, &path)).await.expect(200);
         assert_eq!(
             (head.header("content-length"), head.header("etag")),
@@ -71,7 +71,7 @@ async fn exports_support_caching_and_ranges_like_files() {
         );
         let known = app.request(Method::GET, &path).header("if-none-match", &etag);
         app.send(known).await.expect(304);
-        // Ranges with any bounds.
+        // Ranges may have any bounds.
         let mut joined = Vec::new();
         while joined.len() < size {
             let (first, last) = (joined.len(), joined.len() + size / 7 + 13);
@@ -79,9 +79,9 @@ async fn exports_support_caching_and_ranges_like_files() {
                 app.request(Method::GET, &path).header("range", format!("bytes={first}-{last}"));
             joined.extend(app.send(part.header("if-range", &etag)).await.expect(206).bytes);
         }
-        assert!(joined == whole.bytes, "{path}");
+        assert!(joined == complete.bytes, "{path}");
     }
-    // The same results give the same bytes.
+    // Equal results give equal bytes.
     let archive = app.get(&format!("/v1/jobs/{job}/results.zip")).await.bytes;
     assert_eq!(archive, app.get(&format!("/v1/jobs/{job}/results.zip")).await.bytes);
 
@@ -124,7 +124,7 @@ async fn another_decoder_reads_the_frames_of_movies() {
     app.sign_in(&token);
     let job = done(&app).await;
     let Some(report) = judge_movies(&app, (&job, 2), &token).await else { return };
-    // 16 ms for four frames.
+    // Four frames take 16 ms.
     assert_eq!(report["title"], "250 frames/s, played at 10");
 }
 
@@ -205,8 +205,8 @@ async fn a_movie_is_encoded_on_request_and_stored_like_a_result() {
 
     // Damaged frames have no movie. The answer says so, and a retry of the job restores it.
     let array = app.data().join("results").join(&job).join("snapshot_0000/frames.npy");
-    let whole = std::fs::read(&array).unwrap();
-    std::fs::write(&array, &whole[..whole.len() - 1]).unwrap();
+    let original = std::fs::read(&array).unwrap();
+    std::fs::write(&array, &original[..original.len() - 1]).unwrap();
     let detail = app.movie(&sequence).await.problem(500, "movie_failed");
     assert!(detail.contains("frames.npy is damaged: retry the job"), "{detail}");
     app.get(&sequence).await.expect(202);

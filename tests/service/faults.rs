@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use crate::app::TestApp;
 use crate::samples::Scene;
 
-/// Eight tiles in each of two snapshots, each a large part of a second.
+/// A job with eight tiles in each of two snapshots. Each tile takes a large part of a second.
 fn job(measurement: &str) -> Value {
     json!({
         "measurement": measurement,
@@ -52,6 +52,20 @@ impl TestApp {
     /// The worker that takes short tasks alone, once it runs.
     pub fn light_worker(&self) -> Option<rustix::process::Pid> {
         children(self.pid()).into_iter().find(|pid| is_light(*pid))
+    }
+
+    /// Ends the server and its workers at once, so that none of them tidies up.
+    pub fn cut_power(&mut self) {
+        let workers = children(self.pid());
+        let send = |signal| {
+            for pid in &workers {
+                // The process may have ended already.
+                let _ = rustix::process::kill_process(*pid, signal);
+            }
+        };
+        send(rustix::process::Signal::STOP);
+        self.kill();
+        send(rustix::process::Signal::KILL);
     }
 
     /// Sends SIGKILL to one worker.
@@ -177,9 +191,9 @@ pub async fn orphans(app: &mut TestApp) -> usize {
         let jobs = app.get("/v1/jobs?limit=200").await.json()["items"].as_array().unwrap().len();
         let results = std::fs::read_dir(app.data().join("results")).unwrap().count();
         let results = results.saturating_sub(jobs);
-        let left = count("blobs").abs_diff(known) + results + count("partial") + count("tmp");
-        if left == 0 || start.elapsed().as_secs() > 10 {
-            return left;
+        let surplus = count("blobs").abs_diff(known) + results + count("partial") + count("tmp");
+        if surplus == 0 || start.elapsed().as_secs() > 10 {
+            return surplus;
         }
         tokio::time::sleep(Duration::from_millis(100)).await;
     }

@@ -78,22 +78,22 @@ impl Judge {
             false => json!({ "masks": sha256 }),
         };
         body.as_object_mut().unwrap().extend(asked.as_object().unwrap().clone());
-        let what = if written.measurement { "measurements" } else { "calibrations" };
-        self.app.post(&format!("/v1/{what}"), &body).await
+        let kind = if written.measurement { "measurements" } else { "calibrations" };
+        self.app.post(&format!("/v1/{kind}"), &body).await
     }
 
     /// Uploads a file that must be accepted, and compares its values with those written.
     async fn accept(&self, written: &Written, file: &Path, asked: &Value) {
-        let made = self.send(written, file, asked).await.expect(201).json();
+        let created = self.send(written, file, asked).await.expect(201).json();
         let name = if written.measurement { "snapshots.npy" } else { "masks.npy" };
         let expected = read_stack(&self.folder.path().join(name), &Limits::default()).unwrap().1;
         let frames = written.frames.unwrap_or(expected.dim().0);
         let count = if written.measurement { "snapshots" } else { "frames" };
-        let shape = (&made[count], &made["height"], &made["width"]);
-        assert_eq!(json!(shape), json!([frames, 48, 64]), "{} {made}", written.row);
+        let shape = (&created[count], &created["height"], &created["width"]);
+        assert_eq!(json!(shape), json!([frames, 48, 64]), "{} {created}", written.row);
         if file.ends_with(&written.file) {
             let read_axes = written.axes.as_ref().or(written.read_axes.as_ref());
-            assert_eq!(made["axes"], json!(read_axes), "{} {made}", written.row);
+            assert_eq!(created["axes"], json!(read_axes), "{} {created}", written.row);
         }
         let array = if written.measurement { SceneArray::Measurements } else { SceneArray::Masks };
         let stated = |key: &str| asked[key].as_str().map(str::to_owned);
@@ -103,13 +103,13 @@ impl Judge {
             .named(stated("array"))
             .arranged(axes, written.measurement.then_some((48, 64)));
         let mut opened = source.open().unwrap();
-        let mut found = Vec::new();
+        let mut values = Vec::new();
         while let Some(frame) = opened.next_frame().unwrap() {
-            found.extend(frame);
+            values.extend(frame);
         }
-        let found = Array3::from_shape_vec((frames, 48, 64), found).unwrap();
+        let values = Array3::from_shape_vec((frames, 48, 64), values).unwrap();
         let expected = expected.slice_move(ndarray::s![..frames, .., ..]);
-        let worst = (&found - &expected).iter().fold(0f32, |worst, value| worst.max(value.abs()));
+        let worst = (&values - &expected).iter().fold(0f32, |worst, value| worst.max(value.abs()));
         assert!(worst < 1e-6, "{} {}: {worst}", written.row, written.file.display());
     }
 }
@@ -117,8 +117,8 @@ impl Judge {
 impl Written {
     fn asked(&self) -> Value {
         let mut asked = json!({});
-        let given = [("axes", json!(self.axes)), ("array", json!(self.name))];
-        for (key, value) in given.into_iter().chain([("full_scale", json!(self.full_scale))]) {
+        let options = [("axes", json!(self.axes)), ("array", json!(self.name))];
+        for (key, value) in options.into_iter().chain([("full_scale", json!(self.full_scale))]) {
             if !value.is_null() {
                 asked[key] = value;
             }
@@ -167,8 +167,8 @@ async fn every_row_of_the_tables_holds() {
         let code = command.strip_prefix("python -c \"").unwrap().strip_suffix('"').unwrap();
         let folder = path.parent().unwrap();
         run(Command::new(&judge.python).args(["-c", code]).current_dir(folder));
-        let mut made = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
-        let out = made.find(|path| path.file_stem().is_some_and(|stem| stem == "out"));
+        let mut file_names = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+        let out = file_names.find(|path| path.file_stem().is_some_and(|stem| stem == "out"));
         judge.accept(file, &out.unwrap(), &asked).await;
     }
 }

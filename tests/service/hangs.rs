@@ -65,7 +65,7 @@ async fn a_task_that_kills_its_workers_is_abandoned() {
 }
 
 #[tokio::test]
-async fn a_network_that_hangs_delays_no_other_check_of_its_lab_and_is_given_up() {
+async fn a_hanging_network_delays_no_other_check_and_is_abandoned() {
     let (_folder, app) = with_library("for (;;) pause();").await;
     let (calibration, _) = app.scene(&Scene::SMALL).await;
     let file = app.upload(b"a network".to_vec()).await;
@@ -120,11 +120,11 @@ async fn a_hanging_worker_is_replaced() {
 struct Group(PathBuf);
 
 impl Group {
-    /// A group with a memory limit in bytes; none, after a message, if this machine allows no
-    /// group.
+    /// Creates a group with a memory limit in bytes. Prints a message and returns `None` if this machine does not allow
+    /// it.
     fn new(bytes: u64) -> Option<Self> {
         let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
-        let found = groups.lines().find_map(|line| {
+        let group = groups.lines().find_map(|line| {
             let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
             let (root, limit) = match controllers {
                 "memory" => ("/sys/fs/cgroup/memory", "memory.limit_in_bytes"),
@@ -138,13 +138,13 @@ impl Group {
             std::fs::write(group.0.join(limit), bytes.to_string()).ok()?;
             Some(group)
         });
-        if found.is_none() {
-            eprintln!("SKIPPED: no control group for memory can be made here");
+        if group.is_none() {
+            eprintln!("SKIPPED: this machine allows no control group for memory");
         }
-        found
+        group
     }
 
-    fn take_in(&self, process: u32) {
+    fn add(&self, process: u32) {
         std::fs::write(self.0.join("cgroup.procs"), process.to_string()).unwrap();
     }
 }
@@ -170,7 +170,7 @@ async fn a_task_that_exceeds_the_memory_limit_is_abandoned() {
     let (_folder, app) = with_library(greedy).await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     // Child processes inherit the group. The worker that runs already is outside.
-    group.take_in(app.pid());
+    group.add(app.pid());
     app.kill_worker(0);
     let job = app.submit(&deep(&measurement)).await;
     let done = app.ended(&job).await;

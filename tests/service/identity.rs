@@ -3,20 +3,20 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::Output;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, bounded_program};
 use crate::faults::sha256;
 
 fn run(arguments: &[&str], data: &Path) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let mut command = bounded_program();
     command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
     command.env("RUST_LOG", "error").output().unwrap()
 }
 
 /// Files of users, with their hashes.
 fn files(data: &Path) -> BTreeMap<String, String> {
-    let (mut found, mut folders) = (BTreeMap::new(), Vec::new());
+    let (mut hashes, mut folders) = (BTreeMap::new(), Vec::new());
     folders.extend(["blobs", "results", "partial"].map(|name| data.join(name)));
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(folder).unwrap() {
@@ -25,11 +25,11 @@ fn files(data: &Path) -> BTreeMap<String, String> {
                 folders.push(path);
             } else {
                 let name = path.strip_prefix(data).unwrap().display().to_string();
-                found.insert(name, sha256(&std::fs::read(&path).unwrap()));
+                hashes.insert(name, sha256(&std::fs::read(&path).unwrap()));
             }
         }
     }
-    found
+    hashes
 }
 
 /// Uploads `count` distinct files.
@@ -79,7 +79,7 @@ async fn a_folder_without_its_database_is_rejected() {
     send(&app, 2, "a").await;
     app.stop();
     let data = app.data().to_owned();
-    let whole = std::fs::read(database(&data)).unwrap();
+    let bytes = std::fs::read(database(&data)).unwrap();
     let marker = data.join("sci-recon.json");
     // The database is missing, with and without the marker.
     std::fs::remove_file(database(&data)).unwrap();
@@ -96,7 +96,7 @@ async fn a_folder_without_its_database_is_rejected() {
     std::fs::write(database(&data), b"").unwrap();
     refused(&data, "the database sci-recon.db is empty, though there are a marker and files here");
     // Only the marker exists.
-    std::fs::write(database(&data), whole).unwrap();
+    std::fs::write(database(&data), bytes).unwrap();
     std::fs::remove_file(&marker).unwrap();
     refused(&data, "the marker sci-recon.json is missing");
     // The option accepts the folder.
@@ -119,7 +119,7 @@ async fn a_foreign_or_older_database_is_rejected() {
     let newer = std::fs::read(database(&data)).unwrap();
     std::fs::write(database(&data), older).unwrap();
     refused(&data, "the database is older than the folder");
-    // The database of another service.
+    // The folder has the database of another service.
     let mut other = TestApp::start().await;
     other.stop();
     std::fs::copy(database(other.data()), database(&data)).unwrap();
@@ -128,9 +128,9 @@ async fn a_foreign_or_older_database_is_rejected() {
     std::fs::write(database(&data), newer).unwrap();
     app.restart();
     assert_eq!(files(&data).len(), 4);
-    // The write-ahead log is lost. After a kill, the last records are only there.
+    // The write-ahead log is lost. After a power cut, only the log has the last records.
     send(&app, 1, "c").await;
-    app.kill();
+    app.cut_power();
     remove_log(&data);
     refused(&data, "the database is older than the folder, or has lost its -wal file");
     let app = app.again(&["--workers", "0", "--accept-database"]).await;
@@ -141,7 +141,7 @@ async fn a_foreign_or_older_database_is_rejected() {
 #[tokio::test]
 async fn a_database_from_before_a_token_is_rejected() {
     let mut app = TestApp::start().await;
-    app.kill();
+    app.cut_power();
     let older = ["sci-recon.db", "sci-recon.db-wal"].map(|name| (name, app.data().join(name)));
     let older = older.map(|(name, path)| (name, std::fs::read(path).unwrap()));
     app.token(&["create", "--lab", "a"]);
@@ -166,13 +166,13 @@ async fn many_orphans_are_rejected_and_few_are_quarantined() {
             sqlx::query(sql).bind(count).execute(&mut connection).await.unwrap();
         }
     };
-    // One orphan, as after a crash.
+    // A crash leaves one orphan.
     forget(1).await;
     app.restart();
     assert_eq!((app.blobs_in("blobs"), app.blobs_in("quarantine")), (9, 1));
-    // Many orphans.
+    // Many orphans indicate a wrong database.
     forget(4).await;
-    app.kill();
+    app.cut_power();
     let data = app.data().to_owned();
     let before = files(&data);
     let output = run(&["serve", "--listen", "127.0.0.1:0", "--workers", "0"], &data);
@@ -196,7 +196,7 @@ async fn many_orphans_are_rejected_and_few_are_quarantined() {
 }
 
 #[tokio::test]
-async fn a_first_start_that_was_interrupted_goes_on_and_a_copy_of_it_starts() {
+async fn an_interrupted_first_start_can_be_completed_and_copied() {
     let mut app = TestApp::start().await;
     send(&app, 5, "a").await;
     app.stop();

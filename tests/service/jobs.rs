@@ -83,10 +83,10 @@ async fn a_key_belongs_to_one_job() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     let first = with_key(&app, "run-1", &body).await.expect(201);
-    let again = with_key(&app, "run-1", &body).await.expect(200);
-    assert_eq!(id(&first), id(&again));
-    assert_eq!(first.header("location"), again.header("location"));
-    // The same request in another form.
+    let repeated = with_key(&app, "run-1", &body).await.expect(200);
+    assert_eq!(id(&first), id(&repeated));
+    assert_eq!(first.header("location"), repeated.header("location"));
+    // The same request has another form.
     let mut spelled = body.clone();
     spelled["snapshots"] = json!("all");
     spelled["priority"] = json!(0);
@@ -123,16 +123,16 @@ async fn lists_are_filtered_and_paged() {
         ids.push(id(&app.post("/v1/jobs", &body).await.expect(201)));
     }
     ids.reverse();
-    let (mut seen, mut path) = (Vec::new(), "/v1/jobs?limit=2".to_owned());
+    let (mut found_ids, mut path) = (Vec::new(), "/v1/jobs?limit=2".to_owned());
     loop {
         let page = app.get(&path).await.expect(200).json();
         for item in page["items"].as_array().unwrap() {
-            seen.push(item["id"].as_str().unwrap().to_owned());
+            found_ids.push(item["id"].as_str().unwrap().to_owned());
         }
         let Some(cursor) = page["next_cursor"].as_str() else { break };
         path = format!("/v1/jobs?limit=2&cursor={cursor}");
     }
-    assert_eq!(seen, ids);
+    assert_eq!(found_ids, ids);
     app.post(&format!("/v1/jobs/{}/cancel", ids[0]), &json!({})).await.expect(202);
     for (query, count) in [
         ("state=queued", 4),

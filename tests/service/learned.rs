@@ -44,12 +44,10 @@ pub async fn register(app: &TestApp, calibration: &str, file: &Path) -> crate::a
 /// Checks that the worker's network process is confined, and has no file of the service open.
 fn assert_confined(app: &TestApp) {
     let worker = app.workers()[0].as_raw_nonzero().get().unsigned_abs();
-    let [network] = children(worker)[..] else {
-        panic!("one process of a network should be there")
-    };
+    let [network] = children(worker)[..] else { panic!("one process of a network should exist") };
     let proc = PathBuf::from(format!("/proc/{network}"));
     let status = std::fs::read_to_string(proc.join("status")).unwrap();
-    let has_line = |line: &str| status.lines().any(|found| found == line);
+    let has_line = |line: &str| status.lines().any(|line_text| line_text == line);
     assert!(has_line("NoNewPrivs:\t1") && has_line("Seccomp:\t2"), "{status}");
     let open: Vec<PathBuf> = std::fs::read_dir(proc.join("fd"))
         .unwrap()
@@ -194,9 +192,9 @@ async fn a_network_that_exceeds_its_memory_fails_only_its_job() {
             let process = process.as_raw_nonzero().get().unsigned_abs();
             peak = peak.max(peak_rss_of(process) >> 20);
         }
-        let found = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
-        if found["state"] == "failed" || found["state"] == "succeeded" {
-            break found;
+        let shown = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
+        if shown["state"] == "failed" || shown["state"] == "succeeded" {
+            break shown;
         }
         tokio::time::sleep(std::time::Duration::from_millis(5)).await;
     };

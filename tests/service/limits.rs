@@ -36,7 +36,7 @@ fn announce(app: &TestApp, length: u64) -> RequestBuilder {
     request.header("upload-length", length)
 }
 
-fn taken(answers: &[Answer]) -> usize {
+fn count_created(answers: &[Answer]) -> usize {
     answers.iter().filter(|answer| answer.status == StatusCode::CREATED).count()
 }
 
@@ -49,19 +49,19 @@ async fn concurrent_requests_do_not_exceed_the_limit() {
         app.send(request)
     };
     let answers = join_all((0..14).map(upload)).await;
-    assert_eq!(taken(&answers), 3);
+    assert_eq!(count_created(&answers), 3);
     for answer in answers.iter().filter(|answer| answer.status.as_u16() != 201) {
         answer.problem(507, "quota_exceeded");
     }
     let answers = join_all((0..20).map(|_| app.send(announce(&app, 90_000)))).await;
-    assert_eq!(taken(&answers), 1, "100,000 bytes were left");
+    assert_eq!(count_created(&answers), 1, "100,000 bytes were free");
 }
 
 #[tokio::test]
 async fn prepared_arrays_count_towards_the_quota() {
     let app = TestApp::start().await;
     app.sign_in(&app.token(&["create", "--lab", "a", "--max-bytes", "200000"]));
-    // 8 bits per value, and 32 in the prepared array.
+    // A value has 8 bits in the upload, and 32 in the prepared array.
     let masks = [npy_header("|u1", &[8, 96, 96]), vec![200; 8 * 96 * 96]].concat();
     let answer = app.calibrate(masks.clone()).await;
     let detail = answer.problem(507, "quota_exceeded");
@@ -75,7 +75,9 @@ async fn prepared_arrays_count_towards_the_quota() {
 
 #[tokio::test]
 async fn empty_announcements_do_not_exhaust_the_disk() {
-    let (app, a, b) = two_labs(&["--workers", "0", "--max-upload-bytes", "1000000000000000"]).await;
+    let most = "1000000000000000";
+    let limits = ["--workers", "0", "--max-upload-bytes", most, "--lab-bytes", most];
+    let (app, a, b) = two_labs(&limits).await;
     let disk = rustix::fs::statvfs(app.data()).unwrap();
     let free = disk.f_bavail * disk.f_frsize;
     app.sign_in(&a);
@@ -131,6 +133,68 @@ async fn a_lab_has_quotas_that_do_not_affect_other_labs() {
     assert!(detail.contains("the lab keeps"), "{detail}");
     entitle(&app, &["b", "--bytes", "none", "--share", "2"]);
     app.submit(&jobs[1]).await;
+}
+
+#[tokio::test]
+async fn jobs_of_one_lab_reserve_no_disk_of_others() {
+    let (app, a, b) = two_labs(&["--workers", "0"]).await;
+    let disk = rustix::fs::statvfs(app.data()).unwrap();
+    let free = disk.f_bavail * disk.f_frsize;
+    let mut jobs = Vec::new();
+    for token in [&a, &b] {
+        app.sign_in(token);
+        let (_, measurement) = app.scene(&Scene::SMALL).await;
+        jobs.push(json!({"measurement": measurement, "algorithm": "gap-tv"}));
+    }
+    // A waiting job may reserve any number of bytes, depending on the size of its scene.
+    app.sign_in(&a);
+    app.submit(&jobs[0]).await;
+    let mut database = app.database().await;
+    let reserve = async |database: &mut sqlx::SqliteConnection, bytes: u64| {
+        let update = sqlx::query("UPDATE jobs SET disk_bytes = ? WHERE lab = 'a'");
+        update.bind(bytes as i64).execute(database).await.unwrap();
+    };
+    reserve(&mut database, free / 4).await;
+    app.submit(&jobs[0]).await;
+    // The jobs reserve more than half of the free bytes, which change while other tests run.
+    reserve(&mut database, free * 3 / 10).await;
+    let detail = app.post("/v1/jobs", &jobs[0]).await.problem(507, "insufficient_storage");
+    assert!(detail.contains("this lab has reserved"), "{detail}");
+    let upload = app.request(Method::POST, "/v1/blobs").body(vec![1; 1000]);
+    app.send(upload).await.problem(507, "insufficient_storage");
+    app.sign_in(&b);
+    app.upload(vec![2; 1000]).await;
+    app.submit(&jobs[1]).await;
+    app.send(announce(&app, free / 8)).await.expect(201);
+    // The lab can continue when its jobs reserve less.
+    reserve(&mut database, 1000).await;
+    app.sign_in(&a);
+    app.submit(&jobs[0]).await;
+}
+
+#[tokio::test]
+async fn labs_without_quotas_have_default_ones() {
+    let limits = ["--workers", "0", "--lab-jobs", "2", "--lab-bytes", "1000000"];
+    let app = TestApp::with(&limits).await;
+    app.sign_in(&app.token(&["create", "--lab", "a"]));
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    // There is no other lab yet.
+    for _ in 0..3 {
+        app.submit(&job).await;
+    }
+    app.token(&["create", "--lab", "b"]);
+    let detail = app.post("/v1/jobs", &job).await.problem(429, "queue_full");
+    assert!(detail.contains("of this lab"), "{detail}");
+    let upload = app.request(Method::POST, "/v1/blobs").body(vec![1; 1_000_000]);
+    app.send(upload).await.problem(507, "quota_exceeded");
+    let me = app.get("/v1/me").await.expect(200).json();
+    assert_eq!(
+        (&me["limits"]["lab_jobs"], &me["limits"]["lab_bytes"]),
+        (&json!(2), &json!(1_000_000))
+    );
+    entitle(&app, &["a", "--jobs", "10", "--bytes", "100000000"]);
+    app.submit(&job).await;
 }
 
 /// Starts an upload that then sends nothing.

@@ -5,10 +5,11 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use reqwest::{Body, Method};
 use serde_json::{Value, json};
+use sqlx::Connection;
 
 use crate::app::TestApp;
 use crate::crashes::Shim;
-use crate::downloads::{ask_beside_slow_readers, touch_all};
+use crate::downloads::{ask_during_slow_downloads, touch_all};
 use crate::samples::{Scene, npy_header};
 
 fn setting(name: &str, default: u64) -> u64 {
@@ -55,12 +56,12 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
         while Instant::now() < end {
             let start = Instant::now();
             let answer = app.request(Method::GET, &path).send().await;
-            let whole = match answer {
+            let is_complete = match answer {
                 Ok(answer) if answer.status() == 200 => answer.bytes().await.is_ok(),
                 _ => false,
             };
             times.push(start.elapsed());
-            errors += u64::from(!whole);
+            errors += u64::from(!is_complete);
             tokio::time::sleep(Duration::from_secs(1).saturating_sub(start.elapsed())).await;
         }
         (times, errors)
@@ -88,7 +89,7 @@ async fn two_hundred_clients_poll_while_all_cores_compute() {
 async fn two_hundred_slow_clients_download_while_another_lab_asks() {
     const CLIENTS: usize = 200;
     let seconds = setting("SCI_RECON_LOAD_SLOW_SECONDS", 120);
-    let answers = ask_beside_slow_readers(CLIENTS, Duration::from_secs(seconds)).await;
+    let answers = ask_during_slow_downloads(CLIENTS, Duration::from_secs(seconds)).await;
     let errors = answers.iter().filter(|(status, _)| *status != 200).count();
     let mut times: Vec<Duration> = answers.into_iter().map(|(_, took)| took).collect();
     times.sort();
@@ -192,7 +193,7 @@ async fn a_large_file_comes_from_a_slow_disk() {
 #[tokio::test]
 #[ignore = "minutes; run by make load"]
 async fn large_jobs_in_a_long_queue_do_not_slow_answers() {
-    // 729 tiles each.
+    // Each job has 729 tiles.
     let scene = Scene { frames: 4, height: 440, width: 440, snapshots: 1 };
     long_queue("load_large_jobs", scene, setting("SCI_RECON_LOAD_LARGE", 800)).await;
 }
@@ -202,6 +203,161 @@ async fn large_jobs_in_a_long_queue_do_not_slow_answers() {
 async fn small_jobs_in_a_long_queue_do_not_slow_answers() {
     let scene = Scene { frames: 4, height: 24, width: 24, snapshots: 1 };
     long_queue("load_small_jobs", scene, setting("SCI_RECON_LOAD_SMALL", 20_000)).await;
+}
+
+/// Statements that copy a finished job, a waiting job and a measurement. Parameters: the numbers of copies.
+const COPIES: [&str; 13] = [
+    "PRAGMA synchronous = OFF",
+    "CREATE TEMP TABLE numbers AS
+         WITH RECURSIVE number(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM number WHERE n < max(?1 + ?2, ?3))
+         SELECT n FROM number",
+    "CREATE TEMP TABLE copies AS
+         SELECT n, printf('01a00000-0000-7000-8000-%012d', n) AS job,
+             (SELECT min(id) FROM jobs WHERE state = iif(n <= ?1, 'succeeded', 'queued')) AS original
+         FROM numbers WHERE n <= ?1 + ?2",
+    "INSERT INTO jobs (id, lab, calibration, measurement, spec, state, priority, disk_bytes, result_bytes,
+         assessment, created_at, started_at, finished_at)
+     SELECT job, lab, calibration, measurement, spec, state, priority, 1000, result_bytes,
+         assessment, created_at, started_at, finished_at
+     FROM copies JOIN jobs ON id = original",
+    "INSERT INTO tasks (id, job, lab, ordinal, kind, light, snapshot, snapshots, tile, state, priority, cost,
+         attempt, iterations, passes, fraction, seconds, record, history)
+     SELECT printf('01a00000-0000-7000-%04d-%012d', 8000 + ordinal, n), copies.job, lab, ordinal, kind, light,
+         snapshot, snapshots, tile, state, priority, cost, attempt, iterations, passes, fraction, seconds, record,
+         history
+     FROM copies JOIN tasks ON tasks.job = original",
+    "INSERT INTO attempts (task, attempt, worker, started_at, ended_at, outcome, reason)
+     SELECT printf('01a00000-0000-7000-%04d-%012d', 8000 + ordinal, n), attempts.attempt, attempts.worker,
+         started_at, ended_at, outcome, reason
+     FROM copies JOIN tasks ON tasks.job = original JOIN attempts ON task = tasks.id",
+    "INSERT INTO job_sums
+     SELECT copies.job, cost, tiles_left, tiles_longest, others_left, others_longest, tiles_total,
+         tiles_done, tile_seconds, tile_cost, prepared, previews_done, snapshots_done, iterations, passes
+     FROM copies JOIN job_sums ON job_sums.job = original",
+    "INSERT INTO result_files (job, snapshot, name, size, sha256)
+     SELECT copies.job, snapshot, name, size, sha256
+     FROM copies JOIN result_files ON result_files.job = original",
+    "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)
+     SELECT printf('%064x', n), 1000, iif(n % 2, 'upload', 'prepared'), created_at, touched_at
+     FROM numbers, (SELECT * FROM blobs LIMIT 1) WHERE n <= 2 * ?3",
+    "INSERT INTO holdings (lab, sha256, created_at, touched_at)
+     SELECT 'local', sha256, created_at, touched_at FROM blobs WHERE origin = 'upload' AND size = 1000",
+    "INSERT INTO requests (id, what, lab, calibration, request, limits, created_at)
+     SELECT printf('01a00000-0000-7000-9000-%012d', n), what, lab, calibration, request, limits, created_at
+     FROM numbers, (SELECT * FROM requests WHERE what = 'measurement' LIMIT 1) WHERE n <= ?3",
+    "INSERT INTO measurements (id, lab, calibration, data, prepared, format, sample, axes, snapshots, height,
+         width, full_scale, sequence, created_at)
+     SELECT printf('01a00000-0000-7000-9000-%012d', n), lab, calibration, printf('%064x', 2 * n - 1),
+         printf('%064x', 2 * n), format, sample, axes, snapshots, height, width, full_scale, sequence, created_at
+     FROM numbers, (SELECT * FROM measurements LIMIT 1) WHERE n <= ?3",
+    "DROP TABLE temp.numbers",
+];
+
+/// Fills the database of a stopped service with `finished` finished and `waiting` waiting jobs, and a measurement for
+/// every second finished job.
+async fn fill(app: &TestApp, finished: u64, waiting: u64) {
+    let mut database = app.database().await;
+    // The trigger would write the row of the job again for each of its files.
+    let trigger = "SELECT sql FROM sqlite_master WHERE name = 'result_files_add'";
+    let trigger: String = sqlx::query_scalar(trigger).fetch_one(&mut database).await.unwrap();
+    sqlx::query("DROP TRIGGER result_files_add").execute(&mut database).await.unwrap();
+    for text in COPIES {
+        let copy = sqlx::query(text).bind(finished as i64).bind(waiting as i64);
+        copy.bind(finished as i64 / 2).execute(&mut database).await.unwrap();
+    }
+    sqlx::query(sqlx::AssertSqlSafe(trigger)).execute(&mut database).await.unwrap();
+    database.close().await.unwrap();
+    for job in 1..=finished {
+        let folder = format!("results/01a00000-0000-7000-8000-{job:012}");
+        std::fs::create_dir(app.data().join(folder)).unwrap();
+    }
+}
+
+#[tokio::test]
+#[ignore = "minutes; run by make load"]
+async fn finished_jobs_do_not_slow_answers() {
+    const REQUESTS: usize = 200;
+    let finished = setting("SCI_RECON_LOAD_FINISHED", 100_000);
+    let waiting = setting("SCI_RECON_LOAD_WAITING", 20_000);
+    let most = (2 * waiting + 1000).to_string();
+    let idle = ["--workers", "0", "--scrub-bytes", "0", "--max-jobs", &most];
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let request = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let model = app.submit(&request).await;
+    assert_eq!(app.ended(&model).await["state"], "succeeded");
+    let mut app = app.again(&idle).await;
+    app.submit(&request).await;
+    assert!(app.stop().success());
+    let start = Instant::now();
+    fill(&app, finished, waiting).await;
+    let seconds_to_fill = start.elapsed().as_secs_f64();
+    let start = Instant::now();
+    let app = app.again(&idle).await;
+    let seconds_to_start = start.elapsed().as_secs_f64();
+    let database_bytes = std::fs::metadata(app.data().join("sci-recon.db")).unwrap().len();
+    // An open dashboard listens.
+    let events = app.request(Method::GET, "/v1/events").send().await.unwrap();
+    let counted = app.get("/v1/system").await.expect(200).json();
+    assert_eq!(counted["jobs"]["succeeded"], finished + 1);
+    assert_eq!(counted["jobs"]["queued"], waiting + 1);
+    let deep = format!("/v1/jobs?cursor=01a00000-0000-7000-8000-{:012}", finished / 2);
+    let last = format!("/v1/jobs/01a00000-0000-7000-8000-{:012}", finished + waiting);
+    let paths = [
+        "/v1/jobs",
+        "/v1/jobs?limit=200",
+        "/v1/jobs?state=failed",
+        "/v1/jobs?state=queued",
+        "/v1/jobs?search=nothing",
+        "/v1/jobs?label=nothing",
+        &deep,
+        &format!("/v1/jobs/{model}"),
+        &last,
+        "/v1/measurements",
+        "/v1/calibrations",
+        "/v1/models",
+        "/v1/blobs",
+        "/v1/uploads",
+        "/v1/labs",
+        "/v1/labs/local",
+        "/v1/me",
+        "/v1/system",
+        "/readyz",
+        "/metrics",
+    ];
+    let mut ok = seconds_to_start < 2.0 && database_bytes < 1_000_000_000;
+    let mut figures = serde_json::Map::new();
+    let mut times =
+        async |name: &str, request: &dyn Fn() -> reqwest::RequestBuilder, status: u16| {
+            let mut times = Vec::new();
+            for _ in 0..REQUESTS {
+                let start = Instant::now();
+                let answer = request().send().await.unwrap();
+                assert_eq!(answer.status(), status, "{name}");
+                answer.bytes().await.unwrap();
+                times.push(start.elapsed());
+            }
+            times.sort();
+            let (p50, p99) = (percentile(&times, 50.0), percentile(&times, 99.0));
+            ok &= match name {
+                "POST" => p50 < 20.0,
+                "/metrics" => p99 < 100.0,
+                _ => p99 < 50.0,
+            };
+            figures.insert(name.into(), json!({"p50_ms": p50, "p99_ms": p99}));
+        };
+    for path in paths {
+        times(path, &|| app.request(Method::GET, path), 200).await;
+    }
+    times("POST", &|| app.request(Method::POST, "/v1/jobs").json(&request), 201).await;
+    drop(events);
+    println!(
+        "{}",
+        json!({"target": "load_finished_jobs", "ok": ok, "finished": finished, "waiting": waiting,
+               "seconds_to_fill": seconds_to_fill, "seconds_to_start": seconds_to_start,
+               "database_bytes": database_bytes, "answers": figures,
+               "peak_memory_mib": app.peak_memory()})
+    );
 }
 
 /// Submits jobs, then lets 50 clients request one of them and the list once a second, while more

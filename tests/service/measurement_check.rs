@@ -64,15 +64,15 @@ async fn a_measurement_is_checked_against_its_calibration() {
     assert!(moved["warnings"][0]["detail"].as_str().unwrap().contains("-2 rows and -1 columns"));
     let full = post(&|body| body["saturation"] = json!(900)).await;
     assert!(codes(&full).contains(&"saturated".to_owned()), "{full:#}");
-    // A measurement without one of the calibration's patterns.
+    // The measurement lacks one of the calibration's patterns.
     let mut lacking = captures.clone();
     let other = Lab::new("[camera]\nbackground = 0.1\n[sub_apertures]\nopen_share = 0.25\n");
     lacking["masks"][4] = other.send(&app).await["masks"][4].clone();
     lacking.as_object_mut().unwrap().remove("patterns");
     let wrong = app.calibrate_captures(&lacking).await;
     let lost = post(&|body| body["calibration"] = wrong["id"].clone()).await;
-    let seen = codes_and_frames(&lost["warnings"]);
-    assert!(seen.contains(&("missing_pattern".into(), vec![4])), "{lost:#}");
+    let found_codes = codes_and_frames(&lost["warnings"]);
+    assert!(found_codes.contains(&("missing_pattern".into(), vec![4])), "{lost:#}");
     // Warnings are copied to the job and its manifest.
     let body = json!({"measurement": moved["id"], "algorithm": "gap-tv"});
     let job = app.submit(&body).await;
@@ -91,7 +91,7 @@ async fn a_measurement_is_checked_against_its_calibration() {
     assert_eq!(answer.json()["pointer"], "/dark/0");
 }
 
-/// Large enough to detect small errors.
+/// Large enough for the detection of small errors.
 const SCENE: Scene = Scene { frames: 4, height: 256, width: 256, snapshots: 1 };
 
 /// The values of a float32 .npy file after a change, as another such file.
@@ -128,7 +128,7 @@ async fn silent_errors_of_the_optics_are_detected() {
 #[tokio::test]
 async fn a_job_warns_of_a_bad_calibration_and_of_shifted_masks() {
     let mut app = TestApp::start().await;
-    // One pattern twice, with 12 bits in 16.
+    // One pattern is shown twice, and the values have 12 bits in 16.
     let masks = changed(&SCENE.masks(), 4 * SCENE.height * SCENE.width, |_, value| value);
     let plane = SCENE.height * SCENE.width;
     let values: Vec<f32> = masks[masks.len() - 16 * plane..]
@@ -173,8 +173,8 @@ async fn twelve_bits_in_sixteen_are_detected() {
         let sha256 = app.upload(file).await;
         let mut body = json!({ "calibration": calibration, "data": sha256 });
         let codes = async |body: &Value| {
-            let made = app.post("/v1/measurements", body).await.expect(201).json();
-            codes_and_frames(&made["warnings"])
+            let created = app.post("/v1/measurements", body).await.expect(201).json();
+            codes_and_frames(&created["warnings"])
                 .into_iter()
                 .map(|(code, _)| code)
                 .collect::<Vec<_>>()

@@ -76,7 +76,7 @@ async fn images_show_the_frames_unchanged() {
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
     app.get(&format!("{pictures}/difference-2")).await.expect(200);
 
-    // Images of masks and measurement.
+    // Masks and measurement have images too.
     let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
     let masks = format!("/v1/calibrations/{}/pictures", calibration.as_str().unwrap());
     for name in ["mask-4", "mean", "gram", "dead"] {
@@ -122,9 +122,9 @@ async fn frames_are_compared_with_a_known_truth() {
         });
         crate::samples::npy(&shape, pixels)
     };
-    let one = app.upload(truth(1..2)).await;
+    let one_snapshot = app.upload(truth(1..2)).await;
     app.ended(&job).await;
-    let quality = app.get(&format!("{path}{one}")).await.expect(200).json();
+    let quality = app.get(&format!("{path}{one_snapshot}")).await.expect(200).json();
     let psnr = quality["psnr"].as_f64().unwrap();
     assert!((24.0..60.0).contains(&psnr), "{quality:#}");
     assert!((0.5..1.0).contains(&quality["ssim"].as_f64().unwrap()), "{quality:#}");
@@ -132,8 +132,8 @@ async fn frames_are_compared_with_a_known_truth() {
     let mean = frames.iter().map(|frame| frame["psnr"].as_f64().unwrap()).sum::<f64>() / 4.0;
     assert!((mean - psnr).abs() < 1e-9);
     // The true frames of all snapshots give the same result; those of another snapshot do not.
-    let all = app.upload(truth(0..2)).await;
-    assert_eq!(app.get(&format!("{path}{all}")).await.json()["psnr"], quality["psnr"]);
+    let all_snapshots = app.upload(truth(0..2)).await;
+    assert_eq!(app.get(&format!("{path}{all_snapshots}")).await.json()["psnr"], quality["psnr"]);
     let other = app.upload(truth(0..1)).await;
     assert!(app.get(&format!("{path}{other}")).await.json()["psnr"].as_f64().unwrap() < psnr);
     let three = app.upload(crate::samples::constant(&[3, 48, 64], 0.5)).await;

@@ -77,7 +77,7 @@ async fn a_job_reconstructs_the_scene() {
         let listed = app.get(&base).await.expect(200).json();
         assert_eq!(listed["ready"], true);
         let files = listed["files"].as_array().unwrap();
-        // EXR and PNG of each frame, the stack, the array, the manifest.
+        // The files are EXR and PNG of each frame, the stack, the array and the manifest.
         assert_eq!(files.len(), 4 + 4 + 4);
         for file in files {
             let answer = app.get(file["href"].as_str().unwrap()).await.expect(200);
@@ -108,12 +108,12 @@ async fn results_are_downloaded_in_ranges() {
     app.ended(&job).await;
     let path = format!("/v1/jobs/{job}/snapshots/1/frames/2.exr");
     app.get(&format!("/v1/jobs/{job}/snapshots/0/frames/2.exr")).await.problem(404, "not_found");
-    let whole = app.get(&path).await.expect(200);
-    assert_eq!(whole.header("content-type"), "image/x-exr");
-    assert_eq!(whole.header("accept-ranges"), "bytes");
-    assert_eq!(whole.bytes[..4], [0x76, 0x2f, 0x31, 0x01], "the magic number of EXR");
-    let size = whole.bytes.len();
-    let etag = whole.header("etag").to_owned();
+    let complete = app.get(&path).await.expect(200);
+    assert_eq!(complete.header("content-type"), "image/x-exr");
+    assert_eq!(complete.header("accept-ranges"), "bytes");
+    assert_eq!(complete.bytes[..4], [0x76, 0x2f, 0x31, 0x01], "the magic number of EXR");
+    let size = complete.bytes.len();
+    let etag = complete.header("etag").to_owned();
     let ask = |headers: &[(&'static str, String)]| {
         let mut request = app.request(Method::GET, &path);
         for (name, value) in headers {
@@ -125,10 +125,10 @@ async fn results_are_downloaded_in_ranges() {
     assert_eq!(head.header("content-length"), size.to_string());
     assert_eq!(head.header("etag"), etag);
     let part = ask(&[("range", "bytes=100-199".into())]).await.expect(206);
-    assert_eq!(part.bytes, whole.bytes[100..200]);
+    assert_eq!(part.bytes, complete.bytes[100..200]);
     assert_eq!(part.header("content-range"), format!("bytes 100-199/{size}"));
     let tail = ask(&[("range", "bytes=-10".into()), ("if-range", etag.clone())]).await.expect(206);
-    assert_eq!(tail.bytes, whole.bytes[size - 10..]);
+    assert_eq!(tail.bytes, complete.bytes[size - 10..]);
     let stale = ask(&[("range", "bytes=-10".into()), ("if-range", "\"x\"".into())]).await;
     assert_eq!(stale.expect(200).bytes.len(), size);
     let beyond: Answer = ask(&[("range", format!("bytes={size}-"))]).await;
@@ -137,7 +137,7 @@ async fn results_are_downloaded_in_ranges() {
     ask(&[("if-none-match", etag.clone())]).await.expect(304);
     let first = ask(&[("range", format!("bytes=0-{}", size / 2))]).await.expect(206).bytes;
     let second = ask(&[("range", format!("bytes={}-", size / 2 + 1))]).await.expect(206).bytes;
-    assert_eq!([first, second].concat(), whole.bytes);
+    assert_eq!([first, second].concat(), complete.bytes);
 }
 
 /// A schedule that keeps a worker busy for seconds with each tile.

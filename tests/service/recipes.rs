@@ -1,4 +1,4 @@
-//! The shell commands of the documents, pasted one after the other into one shell.
+//! Runs the shell commands of the documents in one shell, in their order.
 
 use std::path::Path;
 use std::process::Command;
@@ -24,9 +24,9 @@ fn recipes(document: &str, port: u16, folder: &Path) -> Vec<String> {
     ours.collect()
 }
 
-/// Runs the shell blocks of some documents in their order, and returns their output; empty after
-/// [`skip`].
-fn pasted(documents: &[&str], least: usize) -> String {
+/// Runs the shell blocks of some documents in their order, and returns their output. There must be at least `minimum`
+/// blocks. Returns an empty text after [`skip`].
+fn pasted(documents: &[&str], minimum: usize) -> String {
     if !has_programs(&["curl", "jq"], "curl jq") {
         return String::new();
     }
@@ -35,15 +35,15 @@ fn pasted(documents: &[&str], least: usize) -> String {
     for name in ["demo", "runtime"] {
         std::os::unix::fs::symlink(root.join(name), folder.path().join(name)).unwrap();
     }
-    let place = folder.path().join("target/release");
-    std::fs::create_dir_all(&place).unwrap();
+    let programs = folder.path().join("target/release");
+    std::fs::create_dir_all(&programs).unwrap();
     let program = env!("CARGO_BIN_EXE_sci-recon");
-    std::os::unix::fs::symlink(program, place.join("sci-recon")).unwrap();
+    std::os::unix::fs::symlink(program, programs.join("sci-recon")).unwrap();
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let recipes: Vec<_> =
         documents.iter().flat_map(|document| recipes(document, port, folder.path())).collect();
-    assert!(recipes.len() >= least, "{recipes:#?}");
-    // Job control, as in an interactive shell. The trap ends the processes that are left.
+    assert!(recipes.len() >= minimum, "{recipes:#?}");
+    // The shell has job control, like an interactive one. The trap ends the remaining processes.
     let script = format!(
         "set -e -m -o pipefail\ntrap 'kill $(jobs -p) 2> /dev/null || true; wait' EXIT\n{}",
         recipes.join("\n")

@@ -181,16 +181,16 @@ pub async fn cutting(service: String) -> (SocketAddr, Arc<AtomicU64>) {
         for number in 0u64.. {
             let (mut client, _) = listener.accept().await.unwrap();
             let (service, cuts) = (service.clone(), counter.clone());
-            let left = AtomicU64::new(1_000 + (number * 7_919_000) % 900_000);
+            let budget = AtomicU64::new(1_000 + (number * 7_919_000) % 900_000);
             tokio::spawn(async move {
                 let mut server = TcpStream::connect(&service).await.unwrap();
                 let (from_client, to_client) = client.split();
                 let (from_server, to_server) = server.split();
                 tokio::select! {
-                    () = pump(from_client, to_server, &left) => {}
-                    () = pump(from_server, to_client, &left) => {}
+                    () = pump(from_client, to_server, &budget) => {}
+                    () = pump(from_server, to_client, &budget) => {}
                 }
-                cuts.fetch_add(u64::from(left.into_inner() == 0), Ordering::Relaxed);
+                cuts.fetch_add(u64::from(budget.into_inner() == 0), Ordering::Relaxed);
             });
         }
     });

@@ -10,7 +10,7 @@ use crate::samples::Scene;
 
 const SCENE: Scene = Scene { frames: 4, height: 48, width: 64, snapshots: 7 };
 
-/// Two tiles in each of two runs.
+/// A job with two tiles in each of two runs.
 fn job(measurement: &str, iterations: u32) -> Value {
     json!({
         "measurement": measurement,
@@ -64,11 +64,11 @@ async fn a_sequence_is_reconstructed_jointly_and_blended() {
     assert_eq!((&content["pilot"], &content["runs"][6]), (&Value::Null, &json!([6, 6])));
     let each = results_of(&alone, &each, 7).await;
     assert_ne!(each, expected);
-    let mut one = job(&measurement, 6);
-    one["snapshots"] = json!(0);
-    let (one, _) = done(&alone, &one).await;
-    let one = results_of(&alone, &one, 1).await;
-    assert!(one.iter().all(|(name, hash)| each.get(name) == Some(hash)));
+    let mut single_body = job(&measurement, 6);
+    single_body["snapshots"] = json!(0);
+    let (single_body, _) = done(&alone, &single_body).await;
+    let single_body = results_of(&alone, &single_body, 1).await;
+    assert!(single_body.iter().all(|(name, hash)| each.get(name) == Some(hash)));
 
     // The camera's times show a pause.
     let data = app.upload(SCENE.snapshots()).await;

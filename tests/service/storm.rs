@@ -30,7 +30,7 @@ struct Ledger {
     started: BTreeMap<&'static str, u32>,
 }
 
-/// The answer, or none after an error of the connection.
+/// Sends a request. Returns `None` after an error of the connection.
 async fn answer(request: RequestBuilder) -> Option<Answer> {
     let response = request.timeout(Duration::from_secs(30)).send().await.ok()?;
     let (status, headers) = (response.status(), response.headers().clone());
@@ -94,8 +94,8 @@ fn verify(data: &Path) -> Value {
 
 async fn prepared(app: &TestApp, calibration: &str) -> Option<String> {
     let query = "SELECT prepared FROM calibrations WHERE id = ?";
-    let found = sqlx::query_scalar(query).bind(calibration);
-    found.fetch_optional(&mut app.database().await).await.unwrap()
+    let masks = sqlx::query_scalar(query).bind(calibration);
+    masks.fetch_optional(&mut app.database().await).await.unwrap()
 }
 
 fn copy_of(from: &Path, to: &Path) {
@@ -111,7 +111,7 @@ async fn random_kills_lose_and_change_nothing() {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folder = tempfile::tempdir().unwrap();
     let mut app = TestApp::with(&["--workers", "2", "--max-jobs", "10000"]).await;
-    // The expected results, without any kill.
+    // Computes the expected results without kills.
     let lab = Lab::new("");
     let captures = lab.send(&app).await;
     let undisturbed = app.calibrate_captures(&captures).await;
@@ -140,9 +140,12 @@ async fn random_kills_lose_and_change_nothing() {
         match kind {
             "calibration" => {
                 let body = json!({ "captures": captures });
-                let made = answer(app.request(Method::POST, "/v1/calibrations").json(&body)).await;
-                if let Some(made) = made.filter(|made| made.status == StatusCode::ACCEPTED) {
-                    ledger.calibrations.push(made.json()["id"].as_str().unwrap().to_owned());
+                let accepted =
+                    answer(app.request(Method::POST, "/v1/calibrations").json(&body)).await;
+                if let Some(accepted) =
+                    accepted.filter(|accepted| accepted.status == StatusCode::ACCEPTED)
+                {
+                    ledger.calibrations.push(accepted.json()["id"].as_str().unwrap().to_owned());
                 }
                 tokio::time::sleep(pause).await;
             }
@@ -162,14 +165,16 @@ async fn random_kills_lose_and_change_nothing() {
                 }
             }
             "job" => {
-                let made = app.request(Method::POST, "/v1/jobs").json(&job(&measurement));
-                if let Some(made) = answer(made).await.filter(|made| made.status == 201) {
-                    ledger.jobs.insert(made.json()["id"].as_str().unwrap().to_owned());
+                let accepted = app.request(Method::POST, "/v1/jobs").json(&job(&measurement));
+                if let Some(accepted) =
+                    answer(accepted).await.filter(|accepted| accepted.status == 201)
+                {
+                    ledger.jobs.insert(accepted.json()["id"].as_str().unwrap().to_owned());
                 }
                 tokio::time::sleep(pause).await;
             }
             "delete" => {
-                // The oldest job, which may not have ended yet.
+                // Picks the oldest job, which may not have ended yet.
                 let Some(victim) = ledger.jobs.first().cloned() else { continue };
                 let request = app.request(Method::DELETE, &format!("/v1/jobs/{victim}"));
                 match answer(request).await.map(|answer| answer.status.as_u16()) {
@@ -202,13 +207,13 @@ async fn random_kills_lose_and_change_nothing() {
             }
             _ => {
                 let Some(copy) = ledger.copies.last() else { continue };
-                let place = tempfile::tempdir().unwrap();
-                copy_of(copy, &place.path().join("data"));
-                let mut other = TestApp::on(place, "data", &["--workers", "1"]).await;
+                let copy_folder = tempfile::tempdir().unwrap();
+                copy_of(copy, &copy_folder.path().join("data"));
+                let mut other = TestApp::on(copy_folder, "data", &["--workers", "1"]).await;
                 kill_later(other.pid(), pause).await.unwrap();
                 other.restart();
-                let found = verify(other.data());
-                let bad = found["damaged"] != json!([]) || found["missing"] != json!([]);
+                let report = verify(other.data());
+                let bad = report["damaged"] != json!([]) || report["missing"] != json!([]);
                 wrong_copies += u32::from(bad);
                 let list = other.get("/v1/jobs?state=succeeded&limit=200").await.expect(200).json();
                 for item in list["items"].as_array().unwrap() {
@@ -243,12 +248,12 @@ async fn random_kills_lose_and_change_nothing() {
         }
         match prepared(&app, calibration).await {
             None => lost += 1,
-            Some(found) => wrong += u32::from(found != masks),
+            Some(prepared) => wrong += u32::from(prepared != masks),
         }
     }
     for (hash, size) in &ledger.uploads {
-        let found = app.get(&format!("/v1/blobs/{hash}")).await;
-        lost += u32::from(found.status != 200 || found.json()["size"] != *size);
+        let blob = app.get(&format!("/v1/blobs/{hash}")).await;
+        lost += u32::from(blob.status != 200 || blob.json()["size"] != *size);
         let file = std::fs::read(app.data().join("blobs").join(&hash[..2]).join(&hash[2..]));
         wrong += u32::from(file.map_or(true, |bytes| sha256(&bytes) != *hash));
     }
@@ -258,34 +263,34 @@ async fn random_kills_lose_and_change_nothing() {
     }
     // After a deletion without an answer, everything or nothing exists.
     for job in &unsure {
-        let there = app.get(&format!("/v1/jobs/{job}")).await.status == 200;
+        let exists = app.get(&format!("/v1/jobs/{job}")).await.status == 200;
         let files = app.data().join("results").join(job).exists();
-        wrong += u32::from(files && !there);
+        wrong += u32::from(files && !exists);
     }
     for copy in &ledger.copies {
-        let found = verify(copy);
-        wrong_copies += u32::from(found["damaged"] != json!([]) || found["missing"] != json!([]));
+        let report = verify(copy);
+        wrong_copies += u32::from(report["damaged"] != json!([]) || report["missing"] != json!([]));
     }
-    let left = orphans(&mut app).await;
-    let found = verify(app.data());
+    let orphan_count = orphans(&mut app).await;
+    let report = verify(app.data());
     // A kill may keep the record of a job whose files are deleted. Deleting the job again removes
     // it.
-    let missing = found["missing"].as_array().unwrap().iter();
+    let missing = report["missing"].as_array().unwrap().iter();
     let missing = missing
         .filter(|name| !unsure.iter().any(|job| name.as_str().unwrap().contains(job.as_str())))
         .count();
     let quarantined = app.data().join("quarantine");
     let ok = lost + wrong + back + wrong_copies == 0
-        && left == 0
+        && orphan_count == 0
         && missing == 0
-        && found["damaged"] == json!([]);
+        && report["damaged"] == json!([]);
     println!(
         "{}",
         json!({"target": "storm", "ok": ok, "kills": rounds, "begun": ledger.started,
                "uploads": ledger.uploads.len(), "calibrations": ledger.calibrations.len(),
                "jobs": ledger.jobs.len(), "deleted": ledger.deleted.len(),
                "copies": ledger.copies.len(), "restored": restored, "lost": lost, "wrong": wrong,
-               "back": back, "wrong_copies": wrong_copies, "left": left, "found": found,
+               "back": back, "wrong_copies": wrong_copies, "left": orphan_count, "found": report,
                "quarantine": quarantined.exists(), "seed": seed})
     );
     assert!(ok);

@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, bounded_program};
 
 /// The error output of a command on a folder, and whether the command succeeded.
 fn run(arguments: &[&str], data: &Path) -> (bool, String) {
-    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    let mut command = bounded_program();
     let output = command.args(&arguments[..1]).arg("--data").arg(data).args(&arguments[1..]);
     let output = output.output().unwrap();
     (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
@@ -35,8 +35,8 @@ async fn a_copy_of_a_newer_version_is_refused_unchanged() {
     (mark["schema"], mark["version"]) = (9999.into(), "9.9.9".into());
     std::fs::write(&marker, mark.to_string()).unwrap();
     let before = std::fs::read(new.join("sci-recon.db")).unwrap();
-    let again = folder.path().join("again").display().to_string();
-    for arguments in [&serve[..], &["verify"], &["backup", "--out", &again], &["token", "list"]] {
+    let second = folder.path().join("again").display().to_string();
+    for arguments in [&serve[..], &["verify"], &["backup", "--out", &second], &["token", "list"]] {
         let (succeeded, text) = run(arguments, &new);
         assert!(!succeeded, "{arguments:?}");
         assert!(text.contains("by version 9.9.9 (schema 9999)"), "{arguments:?}: {text}");

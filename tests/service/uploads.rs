@@ -140,10 +140,10 @@ async fn memory_is_bounded_while_a_large_stack_is_uploaded() {
     assert_eq!(answer.json()["size"], size);
     let uploaded = app.peak_memory();
     let masks = json!({ "masks": answer.json()["sha256"] });
-    let made = app.post("/v1/calibrations", &masks).await;
-    assert!([201, 202].contains(&made.status.as_u16()), "{}", made.json());
-    let place = format!("/v1/calibrations/{}?wait=20", id(&made));
-    while app.get(&place).await.expect(200).json()["state"] != "ready" {}
+    let created = app.post("/v1/calibrations", &masks).await;
+    assert!([201, 202].contains(&created.status.as_u16()), "{}", created.json());
+    let path = format!("/v1/calibrations/{}?wait=20", id(&created));
+    while app.get(&path).await.expect(200).json()["state"] != "ready" {}
     let checked = app.peak_memory();
     eprintln!("peak of the server: {uploaded} MiB after the upload, {checked} MiB after the check");
     assert!(checked < 200, "{checked} MiB");

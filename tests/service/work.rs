@@ -44,10 +44,10 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     let expected = [0.02, 0.024, 0.028, 0.032];
     assert!(starts.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{starts:?}");
     assert_eq!(manifest["run"]["job"], job);
-    let whole = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
-    assert_eq!(whole["content"]["snapshots"][0]["summary"], content["summary"]);
-    // Prepare, preview, six tiles, assemble, manifest.
-    assert_eq!(whole["run"]["tasks"], 10);
+    let job_manifest = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
+    assert_eq!(job_manifest["content"]["snapshots"][0]["summary"], content["summary"]);
+    // The tasks are prepare, preview, six tiles, assemble and manifest.
+    assert_eq!(job_manifest["run"]["tasks"], 10);
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

@@ -67,7 +67,7 @@ fn frames_do_not_depend_on_the_batches_of_the_clip() {
 }
 
 #[test]
-fn encoder_features_depend_only_on_nearby_blocks_and_frames() {
+fn encoder_features_depend_only_on_adjacent_blocks_and_frames() {
     let Some(library) = library() else { return };
     let source = NetworkSource::new(Some(library), Device::Cpu);
     let mut networks = WarmNetworks::new(source);

@@ -92,6 +92,27 @@ pub enum FormatError {
     SnapshotZero { snapshot: usize, snapshots: usize },
 }
 
+/// A state of the disk that ends without anybody changing the data: work waits for it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DiskTrouble {
+    /// The disk is full, or a quota is exhausted.
+    Full,
+    /// The file system is read-only.
+    ReadOnly,
+}
+
+impl DiskTrouble {
+    /// The state of the disk that an error reports, if it does.
+    pub fn of(error: &io::Error) -> Option<Self> {
+        use io::ErrorKind::{QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+        match error.kind() {
+            StorageFull | QuotaExceeded => Some(Self::Full),
+            ReadOnlyFilesystem => Some(Self::ReadOnly),
+            _ => None,
+        }
+    }
+}
+
 impl FormatError {
     /// A stable identifier of the error, for programs.
     pub fn code(&self) -> &'static str {
@@ -121,10 +142,12 @@ impl FormatError {
         !matches!(self, Self::Io { .. } | Self::Internal(_))
     }
 
-    /// True if the disk is full or a quota is exhausted.
-    pub fn is_disk_full(&self) -> bool {
-        use io::ErrorKind::{QuotaExceeded, StorageFull};
-        matches!(self, Self::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
+    /// The state of the disk that is the cause, if it is.
+    pub fn disk_trouble(&self) -> Option<DiskTrouble> {
+        match self {
+            Self::Io { source, .. } => DiskTrouble::of(source),
+            _ => None,
+        }
     }
 
     pub(super) fn malformed(format: Format, problem: impl Into<String>) -> Self {

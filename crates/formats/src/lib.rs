@@ -43,7 +43,7 @@ pub mod validate;
 pub use axes::{Axes, Expected};
 pub use channels::Channels;
 pub use colour::open_colours;
-pub use error::FormatError;
+pub use error::{DiskTrouble, FormatError};
 pub use format::Format;
 pub use limits::Limits;
 pub use open::{Wanted, collect, open_array, open_stack, read_stack};

@@ -28,6 +28,8 @@ pub enum Subject {
     Measurement,
     /// The reconstructed frames.
     Result,
+    /// A job that waits or runs.
+    Job,
 }
 
 /// The stable identifier of a finding. Codes are part of the API and never change.
@@ -70,6 +72,7 @@ pub enum FindingCode {
     FastMotion,
     UnfamiliarMasks,
     UnevenError,
+    NoTileWorkers,
 }
 
 /// The description of a [`FindingCode`].
@@ -96,7 +99,7 @@ impl FindingCode {
     /// The description of this code.
     pub const fn entry(self) -> Entry {
         use Severity::{Error, Warning};
-        use Subject::{Calibration, Measurement, Result};
+        use Subject::{Calibration, Job, Measurement, Result};
         const REPEAT_PATTERNS: &str =
             "check the LCoS pattern sequence and its trigger, then record again";
         const REDUCE_EXPOSURE: &str =
@@ -332,6 +335,14 @@ impl FindingCode {
                 Warning,
                 "a part of the picture is expected to be much worse than the rest",
                 "look at the map of the expected error before relying on this part",
+            ),
+            Self::NoTileWorkers => (
+                &[Job],
+                Warning,
+                Warning,
+                "no worker takes tiles, so the job makes no progress",
+                "ask the administrator to start workers: `serve --workers N` on the machine of the service, or \
+                 `sci-recon worker` on another one",
             ),
         };
         Entry { subjects, severity, worst, title, remedy }

@@ -29,15 +29,15 @@ pub struct Backup {
     /// Files that were copied, the database among them.
     pub files: u64,
     pub bytes: u64,
-    /// Files that were copied, though their bytes are not those on record.
+    /// Files that were copied although their bytes differ from the recorded hash.
     pub damaged: Vec<String>,
-    /// Files on record that are not there.
+    /// Recorded files that are missing.
     pub missing: Vec<String>,
 }
 
 impl Store {
-    /// Copies everything into the new folder `to`, which appears when all is in it. A damaged file is copied
-    /// and named. What is left of a copy to the same place that was killed is removed.
+    /// Copies everything into the new folder `to`, which appears when all is in it. A damaged file is copied and named.
+    /// The rest of an earlier copy to this folder that was killed is removed.
     pub async fn backup(&self, to: &Path) -> Result<Backup> {
         let place = to.to_owned();
         let draft = on_files(move || Draft::new(&place)).await?;
@@ -94,7 +94,7 @@ impl Store {
         Err(StoreError::Restless(ROUNDS))
     }
 
-    /// Gives second names to what this database knows of and has none yet; says what is missing. None if
+    /// Gives second names to what this database knows of and has none yet; says what is missing. Returns `None` if
     /// something was deleted since the database was written.
     async fn complete_names(
         &self,
@@ -225,8 +225,7 @@ impl Draft {
     }
 }
 
-/// Whether a folder of such a name is a copy that was broken off, perhaps before its mark was written, or just
-/// before it got its own name.
+/// True if a folder with this suffix is an interrupted copy: before its mark was written, or just before its rename.
 fn is_draft(folder: &Path, marker: &Path) -> Result<bool> {
     let mark = fs::read(marker).unwrap_or_default();
     if mark == identity::UNFINISHED.as_bytes() || identity::is_marker(&mark) {
@@ -245,7 +244,7 @@ fn remove_draft(folder: &Path, marker: &Path) -> Result<()> {
     dir::remove(folder)
 }
 
-/// Gives every file below a folder a second name below another one. What goes meanwhile is let go.
+/// Gives every file below a folder a second name below another one. Files that disappear during this are skipped.
 fn link_all(from: &Path, to: &Path) -> Result<()> {
     fs::create_dir(to).map_err(StoreError::io("make the folder", to))?;
     for path in dir::children(from)? {
@@ -259,7 +258,7 @@ fn link_all(from: &Path, to: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Gives a file a second name; false if it is gone.
+/// Gives a file a second name; false if it does not exist.
 fn link(from: &Path, to: &Path) -> Result<bool> {
     match fs::hard_link(from, to) {
         Ok(()) => Ok(true),
@@ -268,7 +267,7 @@ fn link(from: &Path, to: &Path) -> Result<bool> {
     }
 }
 
-/// Gives a file a second name, if it has none; false if neither is there.
+/// Gives a file a second name, if it has none; false if neither name exists.
 fn name_again(from: &Path, to: &Path) -> Result<bool> {
     if to.exists() {
         return Ok(true);

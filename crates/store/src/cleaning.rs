@@ -21,7 +21,7 @@ const YOUNG: Duration = Duration::from_secs(60);
 const FEW: usize = 3;
 const SHARE: f64 = 0.2;
 
-/// What a row should know of.
+/// A stored thing that needs a row.
 #[derive(Debug, PartialEq, Eq, Hash)]
 enum Thing {
     Blob(Sha256),
@@ -134,7 +134,7 @@ impl Store {
                     // Before the disk is asked again.
                     self.removals.finished().await;
                 }
-                // Taken up again or deleted meanwhile.
+                // The job was retried or deleted in between.
                 Err(StoreError::NotFinal(_) | StoreError::NotFound { .. }) => {}
                 Err(error) => return Err(error),
             }
@@ -146,9 +146,15 @@ impl Store {
 async fn is_known(connection: &mut sqlx::SqliteConnection, thing: &Thing) -> Result<bool> {
     let query = match thing {
         Thing::Blob(sha256) => {
-            sql!("SELECT 1 FROM blobs WHERE sha256 = ?", [sha256])
+            let query = "SELECT 1 FROM blobs WHERE sha256 = ?1
+                         UNION ALL SELECT 1 FROM removals WHERE kind = 'blob' AND id = ?1";
+            sql!(query, [sha256])
         }
-        Thing::Results(job) => sql!("SELECT 1 FROM jobs WHERE id = ?", [job]),
+        Thing::Results(job) => {
+            let query = "SELECT 1 FROM jobs WHERE id = ?1
+                         UNION ALL SELECT 1 FROM removals WHERE kind = 'results' AND id = ?1";
+            sql!(query, [job])
+        }
         Thing::Partial(id) => {
             let query = "SELECT 1 FROM partials WHERE id = ? AND result IS NULL";
             sql!(query, [id])
@@ -202,7 +208,7 @@ fn measure(paths: &[PathBuf]) -> Result<(u64, u64)> {
         let (more, more_bytes) = if path.is_dir() {
             measure(&dir::children(path)?)?
         } else {
-            // It may be gone meanwhile.
+            // It may have been removed in between.
             (1, fs::metadata(path).map_or(0, |meta| meta.len()))
         };
         files += more;

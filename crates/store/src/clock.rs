@@ -1,5 +1,5 @@
-//! How old things are. Wall clocks are set back and forth: what was stored while one was a year behind is not a
-//! year old when it is right again. So age is also counted in the time for which the service has run.
+//! Ages of stored things. Wall clocks jump. A file that was stored while the clock was a year behind is not a year old
+//! once the clock is right. So age also counts the time for which the service has run.
 
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ impl Store {
     pub async fn note_time(&self, since: Duration) -> Result<()> {
         let since = i64::try_from(since.as_millis()).unwrap_or(LONGEST);
         let mut transaction = self.write().await?;
-        // Of two notes without time between them the earlier one counts.
+        // The earlier of two notes without time between them counts.
         sql!(
             "INSERT INTO clock (run, wall)
              VALUES ((SELECT coalesce(max(run), 0) FROM clock) + ?, ?)
@@ -31,8 +31,8 @@ impl Store {
         Ok(transaction.commit().await?)
     }
 
-    /// The moment before which a thing was stamped that is older than this by the clock, and by the time for
-    /// which the service has run: no later than any time that was noted within this time of running.
+    /// Time stamp below which a thing is older than `age`, by the clock and by the running time of the service. It is
+    /// not after any time that was noted within the last `age` of running.
     pub async fn ago(&self, age: Duration) -> Result<Timestamp> {
         let age = i64::try_from(age.as_millis()).unwrap_or(LONGEST);
         let seen: Option<i64> = sql_as!(

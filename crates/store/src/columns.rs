@@ -296,7 +296,7 @@ tuples! {
     (A 0, B 1, C 2, D 3, E 4, F 5)
 }
 
-/// Implements [`FromRow`] for a struct: each field is the column of its name, or what follows `=`.
+/// Implements [`FromRow`] for a struct: each field is the column of the same name, or the expression after `=`.
 macro_rules! from_row {
     (@ $row:ident $field:ident) => { $row.read(stringify!($field))? };
     (@ $row:ident $field:ident $read:expr) => { $read };
@@ -310,7 +310,7 @@ macro_rules! from_row {
     };
 }
 
-/// What a statement yields: a whole row, or a type that is read from it.
+/// The result type of a statement: a whole row, or a type that is read from it.
 pub trait Yield: Sized {
     /// # Errors
     /// [`StoreError::Corrupt`]

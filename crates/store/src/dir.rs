@@ -6,9 +6,23 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use rustix::fs::FallocateFlags;
+
 use super::error::{Result, StoreError};
 use super::locked::LockedFile;
 use engine::job::{JobId, PartialId, Sha256};
+
+/// Reserved bytes as one lab sees them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Reserved {
+    pub own: u64,
+    pub others: u64,
+    /// True if there are other labs, which need room, too.
+    pub is_shared: bool,
+}
+
+/// Bytes of the reserve file: the write-ahead log of thousands of deletions.
+const RESERVE_BYTES: u64 = 32 << 20;
 
 /// The folder with all that the service keeps.
 ///
@@ -22,6 +36,7 @@ use engine::job::{JobId, PartialId, Sha256};
 /// before-updates/       copies of the database from before updates of the program
 /// before-updates/kept/  files that were deleted in the days after an update, for a return to such a copy
 /// tmp/                  files that are being written, locked by their writers
+/// reserve               empty room for a start on a full disk
 /// ```
 #[derive(Debug, Clone)]
 pub struct DataDir {
@@ -61,7 +76,7 @@ impl DataDir {
         self.root.join("sci-recon.db")
     }
 
-    /// Where the file with this hash lies, if it is in the store.
+    /// Path of the file with this hash, if it is in the store.
     pub fn blob(&self, sha256: &Sha256) -> PathBuf {
         let hex = sha256.to_string();
         self.blobs().join(&hex[..2]).join(&hex[2..])
@@ -105,12 +120,12 @@ impl DataDir {
         self.before_updates().join("kept")
     }
 
-    /// What no row knows of is kept here for some days.
+    /// Folder that keeps files without a row for some days.
     pub(crate) fn quarantine(&self) -> PathBuf {
         self.root.join("quarantine")
     }
 
-    /// Takes the lock of the server, of which there is one for each folder.
+    /// Takes the lock of the server. Each folder has one.
     pub(crate) fn lock_server(&self) -> Result<LockedFile> {
         let path = self.root.join("server.lock");
         let file = File::create(&path).map_err(StoreError::io("make", &path))?;
@@ -139,6 +154,34 @@ impl DataDir {
         Ok(removed)
     }
 
+    fn reserve(&self) -> PathBuf {
+        self.root.join("reserve")
+    }
+
+    /// Removes the reserve file if the disk is full, so that a service can start and delete. True if it did.
+    pub(crate) fn give_up_reserve(&self) -> Result<bool> {
+        if self.disk()?.0 >= RESERVE_BYTES / 4 || !self.reserve().exists() {
+            return Ok(false);
+        }
+        remove(&self.reserve()).map(|()| true)
+    }
+
+    /// Makes the reserve file, if it is missing and the disk has room for it and for `min_free` more bytes.
+    pub fn keep_reserve(&self, min_free: u64) -> Result<()> {
+        let path = self.reserve();
+        if path.exists() || self.disk()?.0 < min_free.saturating_add(2 * RESERVE_BYTES) {
+            return Ok(());
+        }
+        let draft = self.tmp().join("reserve");
+        let file = File::create(&draft).map_err(StoreError::io("make", &draft))?;
+        let allocated = rustix::fs::fallocate(&file, FallocateFlags::empty(), 0, RESERVE_BYTES);
+        if let Err(error) = allocated {
+            remove(&draft)?;
+            return Err(StoreError::io("reserve room for", &path)(error.into()));
+        }
+        rename_durably(&draft, &path)
+    }
+
     /// Bytes that are free on the disk of this folder, and its size.
     pub fn disk(&self) -> Result<(u64, u64)> {
         let stat = rustix::fs::statvfs(&*self.root).map_err(|error| {
@@ -147,21 +190,28 @@ impl DataDir {
         Ok((stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize))
     }
 
-    /// Refuses `what` if the disk has no room for its `needed` bytes beside those that are `promised` to others and
-    /// those that stay free.
-    /// Errors: [`StoreError::NoRoom`].
+    /// Refuses `what` if the disk has no room for its `needed` bytes beside those that are reserved and the `min_free`
+    /// ones that stay free. If there are other labs, a lab may reserve half of the bytes that these leave, so that room
+    /// remains for each of them.
+    /// Errors: [`StoreError::NoRoom`]; [`StoreError::NoShare`].
     pub fn check_room(
         &self,
         what: &'static str,
         needed: u64,
-        promised: u64,
-        reserve: u64,
+        reserved: Reserved,
+        min_free: u64,
     ) -> Result<()> {
         let free = self.disk()?.0;
-        if free >= promised.saturating_add(needed).saturating_add(reserve) {
-            return Ok(());
+        let Reserved { own, others, is_shared } = reserved;
+        let promised = own.saturating_add(others);
+        if free < promised.saturating_add(needed).saturating_add(min_free) {
+            return Err(StoreError::NoRoom { what, needed, free, promised, reserve: min_free });
         }
-        Err(StoreError::NoRoom { what, needed, free, promised, reserve })
+        let share = free.saturating_sub(min_free).saturating_sub(others) / 2;
+        if is_shared && own.saturating_add(needed) > share {
+            return Err(StoreError::NoShare { what, needed, own, share });
+        }
+        Ok(())
     }
 }
 
@@ -206,13 +256,13 @@ pub(crate) fn restrict(path: &Path) -> Result<()> {
     fs::set_permissions(path, mode).map_err(StoreError::io("keep for its owner", path))
 }
 
-/// Renames a file or folder that is on the disk already, for good.
+/// Renames a synced file or folder durably.
 pub(crate) fn rename_durably(from: &Path, to: &Path) -> Result<()> {
     fs::rename(from, to).map_err(StoreError::io("move a file to", to))?;
     to.parent().map_or(Ok(()), sync_dir)
 }
 
-/// Makes one folder, for good. It may be there already.
+/// Makes one folder durably. It may exist already.
 pub(crate) fn make_dir_durably(path: &Path) -> Result<()> {
     match fs::create_dir(path) {
         Ok(()) => path.parent().map_or(Ok(()), sync_dir),
@@ -221,7 +271,7 @@ pub(crate) fn make_dir_durably(path: &Path) -> Result<()> {
     }
 }
 
-/// Removes a file or a folder with all in it. It may be gone already.
+/// Removes a file or a folder with its contents. It is no error if it does not exist.
 pub(crate) fn remove(path: &Path) -> Result<()> {
     let result = match fs::symlink_metadata(path) {
         Ok(meta) if meta.is_dir() => fs::remove_dir_all(path),

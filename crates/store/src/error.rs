@@ -1,8 +1,9 @@
-//! What can go wrong in the store.
+//! Errors of the store.
 
 use std::path::{Path, PathBuf};
 
 use engine::job::IllegalTransition;
+use formats::DiskTrouble;
 
 pub type Result<T, E = StoreError> = std::result::Result<T, E>;
 
@@ -74,13 +75,13 @@ pub enum StoreError {
     Ended(engine::job::JobState),
     #[error("the hash should be {expected}, the bytes have {found}")]
     HashMismatch { expected: engine::job::Sha256, found: engine::job::Sha256 },
-    /// Of an upload in pieces, bytes are lost that were on the disk.
+    /// An upload in pieces has lost recorded bytes.
     #[error(
         "{found} bytes of upload {id} are on the disk, fewer than the {recorded} on record: delete it \
          and send the file again"
     )]
     Short { id: engine::job::PartialId, found: u64, recorded: u64 },
-    /// A stored file is gone, or its bytes are not those on record.
+    /// A stored file is missing or differs from its recorded hash.
     #[error("the {what} {name} is damaged on the disk of the service; {}", if *what == "result" {
         "retry its job, and it is made again"
     } else {
@@ -106,6 +107,12 @@ pub enum StoreError {
          are kept in reserve"
     )]
     NoRoom { what: &'static str, needed: u64, free: u64, promised: u64, reserve: u64 },
+    /// The lab has reserved its share of the disk.
+    #[error(
+        "{what} needs {needed} bytes; this lab has reserved {own}, and may reserve {share}, half of the bytes that \
+         other labs leave free: wait until some of its jobs are done, or select fewer snapshots"
+    )]
+    NoShare { what: &'static str, needed: u64, own: u64, share: u64 },
     #[error("the Idempotency-Key {key:?} was used for another request, which made {what} {id}")]
     KeyReused { key: String, what: &'static str, id: String },
     /// A task that blocks was broken off, as at shutdown.
@@ -132,12 +139,12 @@ fn unchecked(id: engine::job::MeasurementId, error: Option<&str>) -> String {
 }
 
 impl StoreError {
-    /// There is no such thing of this kind.
+    /// The error for an identifier that does not exist.
     pub(super) fn missing(what: &'static str, id: impl ToString) -> Self {
         Self::NotFound { what, id: id.to_string() }
     }
 
-    /// Wraps an I/O error with what was tried on what.
+    /// Adds the action and the path to an I/O error.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
         move |source| Self::Io { action, path, source }
@@ -156,14 +163,23 @@ impl StoreError {
         }
     }
 
-    /// True if the disk is full or a quota is used up.
-    pub fn is_disk_full(&self) -> bool {
-        use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+    /// The state of the disk that is the cause, if it is.
+    pub fn disk_trouble(&self) -> Option<DiskTrouble> {
         match self {
-            Self::Io { source, .. } => matches!(source.kind(), StorageFull | QuotaExceeded),
-            // SQLITE_FULL
-            Self::Database(sqlx::Error::Database(error)) => error.code().as_deref() == Some("13"),
-            _ => false,
+            Self::Io { source, .. } => DiskTrouble::of(source),
+            Self::Database(sqlx::Error::Database(error)) => {
+                match error.code()?.parse::<u32>().ok()? {
+                    // SQLITE_FULL
+                    13 => Some(DiskTrouble::Full),
+                    // SQLITE_READONLY, whose reason is in the upper bits, and the errors of SQLite for a write
+                    // (SQLITE_IOERR_WRITE) or a sync (SQLITE_IOERR_FSYNC) that a read-only file system refuses
+                    code if code & 0xff == 8 || matches!(code, 778 | 1034) => {
+                        Some(DiskTrouble::ReadOnly)
+                    }
+                    _ => None,
+                }
+            }
+            _ => None,
         }
     }
 }

@@ -19,8 +19,7 @@ use engine::job::Sha256;
 const REMEMBERED: usize = 65_536;
 /// Bytes that are read at a time.
 const SLICE: usize = 1 << 20;
-/// Slices that are read at the same time for those who wait: files take turns, so that a small one is soon done beside
-/// large ones.
+/// Slices that are read at the same time. Files take turns, so that a small file does not wait for large ones.
 const SLICES_AT_ONCE: usize = 4;
 
 /// A file as it was when it was hashed.
@@ -39,7 +38,7 @@ impl Identity {
     }
 }
 
-/// What follows from the bytes of a file.
+/// Checksums of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Digests {
     pub(super) sha256: Sha256,

@@ -1,10 +1,9 @@
-//! Whether a database and a folder belong together.
+//! Verification that a database and a folder belong together.
 //!
-//! With an empty, an older or another folder's database, all files would be held to be left over. So the
-//! folder has an identifier, in its marker `sci-recon.json` and in the database, and a generation that only
-//! rises: first in the database, then in the marker, at every start and end of a server, every ten
-//! minutes in between, and whenever a token is made or revoked. A database behind its marker is an older
-//! copy, or has lost its write-ahead log.
+//! With an empty, older or foreign database, all files of the folder would count as orphans. So the folder has an
+//! identifier and a generation, in its marker `sci-recon.json` and in the database. The generation only rises, first in
+//! the database and then in the marker: at the start and the end of a server, every ten minutes, and whenever a token
+//! is made or revoked. A database behind its marker is an older copy, or has lost its write-ahead log.
 
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
@@ -23,10 +22,10 @@ use super::migrations::BEFORE_BASELINE;
 use super::upgrade;
 use crate::columns::{sql, sql_as};
 
-/// Who opens a data folder, and so what may become of it.
+/// The purpose for which a data folder is opened. It decides what may change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
-    /// A worker, a backup, a token: the folder is there, and stays as it is.
+    /// For a worker, a backup or a token: the folder exists and is not changed.
     Use,
     /// The server: has the folder for itself, makes it where there is none, and brings it up to date.
     Serve {
@@ -35,7 +34,7 @@ pub enum Purpose {
     },
 }
 
-/// What the folder says of itself.
+/// The marker of the folder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Marker {
     id: Uuid,
@@ -91,7 +90,7 @@ pub(super) async fn check(dir: &DataDir, purpose: Purpose, schema: i64) -> Resul
     })
 }
 
-/// What is wrong, and what to do; neither if the folder is simply none of ours.
+/// The problem and the remedy; `None` if the folder is not a data folder.
 type Refusal = Option<(String, &'static str)>;
 
 const RESTORE: &str = "put the folder's own database back, with its -wal file, or serve a backup; for \
@@ -248,7 +247,7 @@ pub(super) async fn marker(connection: &mut SqliteConnection, schema: i64) -> Re
     Ok(Marker { id, generation, schema, version: env!("CARGO_PKG_VERSION").into() })
 }
 
-/// Puts the marker into the folder, for good; `draft` is on the same disk.
+/// Writes the marker into the folder durably; `draft` is on the same disk.
 pub(super) fn write(folder: &Path, draft: &Path, marker: &Marker) -> Result<()> {
     let text =
         serde_json::to_vec(marker).map_err(|error| StoreError::io("write", draft)(error.into()))?;
@@ -260,7 +259,7 @@ pub(super) fn write(folder: &Path, draft: &Path, marker: &Marker) -> Result<()> 
 
 /// What stands in the place of the marker until a copy is whole: no service starts with it, whatever it accepts.
 pub(super) const UNFINISHED: &str = "a copy that is not finished";
-/// What the name of its folder ends with until then. It has the marker a moment before its own name.
+/// Suffix of the folder's name until then. It has the marker a moment before its own name.
 pub(super) const UNFINISHED_NAME: &str = ".unfinished";
 
 fn is_unfinished(folder: &Path) -> bool {
@@ -311,7 +310,7 @@ mod tests {
         let marker = Some(Ok(Marker { id, generation: 5, schema: 9, version: "1".into() }));
         let torn = Some(Err("no JSON".to_owned()));
         let named = |id, generation| Database::Named { id, generation, schema: 9 };
-        // Of each: the server's verdict without and with the flag, and that of a worker.
+        // Each row has the verdicts for a server without and with the flag, and for a worker.
         for (marker, database, files, verdicts) in [
             (&None, Database::Missing, false, [true, true, false]),
             (&None, Database::Blank, false, [true, true, false]),

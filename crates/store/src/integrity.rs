@@ -1,8 +1,7 @@
-//! Whether stored files have the bytes on record: asked before a file is handed out, and by a slow look at
-//! all of them in between.
+//! Verification of stored files against their recorded hashes: before a file is sent, and by a slow scan of all files.
 //!
-//! A file is read whole the first time that it is asked for, unless this process has written it. What was found holds
-//! until the file changes (its inode, size or time), or until the slow look finds that the disk has changed it.
+//! A file is read whole before it is first sent, unless this process has written it. The verdict holds until its inode,
+//! size or time changes, or until the scan finds damage.
 
 use std::fs::File;
 use std::io::Seek;
@@ -23,25 +22,25 @@ const ROUND: Duration = Duration::from_secs(86_400);
 /// Pause of the slow look when the database or the disk has failed, or when it is done.
 const PAUSE: Duration = Duration::from_secs(10);
 
-/// What a comparison of all records with the disk has found.
+/// The result of a comparison of all records with the disk.
 #[derive(Debug, Default)]
 pub struct Audit {
-    /// Files that are on record.
+    /// Recorded files.
     pub files: u64,
     /// Bytes that were read of them.
     pub bytes: u64,
     /// What SQLite says of the database: `ok`, or what is wrong.
     pub database: String,
-    /// Files that are there with other bytes than those on record.
+    /// Files whose bytes differ from the recorded hash.
     pub damaged: Vec<String>,
-    /// Files that are on record and not there.
+    /// Recorded files that are missing.
     pub missing: Vec<String>,
     /// Blobs, results of jobs and uploads in pieces that no record knows of.
     pub unknown: usize,
 }
 
 impl Audit {
-    /// True if all that is on record is there as it should be.
+    /// True if all recorded files are intact and the database is sound.
     pub fn is_good(&self) -> bool {
         self.damaged.is_empty() && self.missing.is_empty() && self.database == "ok"
     }
@@ -49,8 +48,8 @@ impl Audit {
 
 impl Store {
     /// Opens a result file of a snapshot (or, with none, of the whole job).
-    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet; [`StoreError::Damaged`] if it
-    /// is gone, or its bytes are not those on record.
+    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet; [`StoreError::Damaged`] if it is
+    /// missing or damaged.
     pub async fn open_result(
         &self,
         job: &Job,
@@ -70,13 +69,13 @@ impl Store {
     }
 
     /// Opens a stored file, whose bytes are those of its name.
-    /// Errors: [`StoreError::Damaged`] if it is gone, or its bytes are others.
+    /// Errors: [`StoreError::Damaged`] if it is missing or damaged.
     pub async fn open_blob(&self, sha256: Sha256) -> Result<File> {
         Ok(self.open_intact(&Record { place: Place::Blob(sha256), sha256 }).await?.0)
     }
 
-    /// Where a stored file lies, whose bytes are those of its name.
-    /// Errors: [`StoreError::Damaged`] if it is gone, or its bytes are others.
+    /// Path of a stored file that has the hash in its name.
+    /// Errors: [`StoreError::Damaged`] if it is missing or damaged.
     pub async fn intact_blob(&self, sha256: Sha256) -> Result<PathBuf> {
         self.open_blob(sha256).await?;
         Ok(self.dir().blob(&sha256))
@@ -97,7 +96,7 @@ impl Store {
         .await
     }
 
-    /// Notes that a file is damaged, unless it is not on record any more, and makes an error of it.
+    /// Marks a file as damaged, unless its record was deleted, and returns the error for it.
     async fn damaged(&self, record: &Record) -> StoreError {
         let name = record.name(self.dir());
         if let Err(error) = self.mark(record).await {
@@ -148,6 +147,13 @@ impl Store {
         let verdicts: Vec<String> =
             sql_as!("PRAGMA integrity_check(10)", []).fetch_all(&self.readers).await?;
         audit.database = verdicts.join("; ");
+        let wrong = self.wrong_totals().await?;
+        if audit.database == "ok" && !wrong.is_empty() {
+            audit.database = format!(
+                "running totals differ from a new sum: {}; `serve --accept-database` repairs them",
+                wrong.join(", ")
+            );
+        }
         let mut after = None;
         loop {
             let page = records::page(&mut *self.readers.acquire().await?, after.as_ref()).await?;
@@ -184,7 +190,7 @@ impl Store {
         audit.files += 1;
         audit.bytes += found.map_or(0, |(_, bytes)| bytes);
         if found.is_some_and(|(sha256, _)| sha256 == record.sha256)
-            // It may have been deleted or replaced meanwhile.
+            // It may have been deleted or replaced in between.
             || !records::stands(&mut *self.readers.acquire().await?, record).await?
         {
             return Ok(());
@@ -194,8 +200,8 @@ impl Store {
         Ok(())
     }
 
-    /// Looks at all stored files again and again, at most once a day, reading `rate` bytes in a second, and
-    /// notes what is damaged. Where it stands is on record: a restart goes on there.
+    /// Looks at all stored files again and again, at most once a day, reading `rate` bytes in a second, and notes what
+    /// is damaged. The position is recorded, so that a restart continues there.
     pub async fn scrub(&self, rate: u64) {
         loop {
             let pause = match self.scrub_page(rate).await {
@@ -289,7 +295,7 @@ async fn read_slowly(file: File, rate: u64) -> Result<Digests> {
 }
 
 impl Record {
-    /// Whether the file at this path has the bytes on record.
+    /// True if the file at this path has the recorded hash.
     pub(super) fn is_at(&self, dir: &DataDir) -> Result<bool> {
         match open(&self.path(dir))? {
             Some((file, _)) => Ok(digest(file)?.sha256 == self.sha256),

@@ -1,12 +1,10 @@
 //! All that lasts: SQLite for the records, content-addressed files for the arrays.
 //!
-//! The server and every worker process open the same folder. Files are put in place and removed
-//! while the writer's lock of the database is held, so that a file and its row can't part when two
-//! processes work on the same content: the database is the one mutex of the service. No transaction
-//! is open while anything is computed or uploaded.
+//! The server and every worker process open the same folder. Files move under the writer's lock of the database. So a
+//! file and its row stay together when two processes work on the same content: the database is the only mutex of the
+//! service. No transaction is open while anything is computed or uploaded.
 //!
-//! What comes in goes through `submit` to the `queue`, and from there to the `tables`; nothing
-//! goes the other way.
+//! Requests go through `submit` to the `queue`, and from there to the `tables`. Nothing goes the other way.
 //!
 //! # Errors
 //! Every function that asks the database fails if the database does, and every one that changes files
@@ -48,8 +46,8 @@ use sqlx::sqlite::{
 use sqlx::{Connection, SqlitePool};
 
 pub use backup::Backup;
-pub use dir::DataDir;
 pub(crate) use dir::on_files;
+pub use dir::{DataDir, Reserved};
 pub use error::StoreError;
 pub use identity::Purpose;
 pub use integrity::Audit;
@@ -57,19 +55,19 @@ pub use locked::LockedFile;
 use migrations::Schema;
 pub use queue::{
     Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, Claimant, ClaimedTask, Completion,
-    Estimate, Heartbeat, JobMark, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES,
-    MAX_STARVED, MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask,
-    Work, WorkerEnd,
+    Estimate, Heartbeat, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
+    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
+    WorkerEnd,
 };
 pub use rows::{Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Asked, Blob, BlobRow, Calibration, Entitlement, FIRST_RESERVE, FoundPartial, Inserted, Job,
-    JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration,
-    NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request, RequestKey,
-    RequestMark, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token,
-    WorkerPlace, WorkerRow, WorkerTask, share_error,
+    Asked, Blob, BlobRow, Calibration, Change, Changes, Entitlement, FIRST_RESERVE, FoundPartial,
+    Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse, Made, Measurement, Model,
+    NewCalibration, NewMeasurement, NewModel, NewPartial, Origin, Partial, PartialFile, Request,
+    RequestKey, Reservations, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
+    TileState, Token, WorkerPlace, WorkerRow, WorkerTakes, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 
@@ -80,12 +78,11 @@ pub struct Store {
     /// One connection: within a process, writers wait for each other here and not in SQLite.
     writer: SqlitePool,
     readers: SqlitePool,
-    /// What is ahead of every job, as it was a moment ago.
-    forecast: Arc<tokio::sync::Mutex<Option<Arc<queue::Forecast>>>>,
+    forecasts: Arc<queue::Forecasts>,
     /// Hashes of files that were read before they were handed out.
     hashes: Arc<hashes::Hashes>,
     removals: removal::Removals,
-    /// What was last found wrong with the database.
+    /// Damage of the database that the last check found.
     damage: Arc<Mutex<Option<String>>>,
     /// The number of the newest migration.
     schema: i64,
@@ -109,6 +106,11 @@ impl Store {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
+        if serves && dir.give_up_reserve()? {
+            tracing::warn!(
+                "the disk is full: its reserve is given up, so that jobs and files can be deleted"
+            );
+        }
         identity::check(&dir, purpose, schema.newest()).await?;
         dir.fill()?;
         let copy = if serves { upgrade::save(&dir, schema.newest()).await? } else { None };
@@ -118,6 +120,8 @@ impl Store {
             .foreign_keys(true)
             .busy_timeout(Duration::from_secs(15))
             .journal_mode(SqliteJournalMode::Wal)
+            // Rows of jobs and tasks have one to two kilobytes. In smaller pages they would overflow.
+            .page_size(8192)
             // A worker may write to the data folder alone, and not where SQLite puts its temporary files.
             .pragma("temp_store", "memory")
             // NORMAL survives a killed process, but a power cut could take back the last commits,
@@ -128,8 +132,8 @@ impl Store {
             .max_connections(1)
             .idle_timeout(None)
             .max_lifetime(None)
-            // After some errors, such as a full disk, SQLite has rolled back by itself; sqlx then
-            // fails to roll back again and holds the transaction to be open for ever.
+            // After some errors, such as a full disk, SQLite has rolled back already. sqlx then fails to roll back
+            // again and takes the transaction for open.
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         let writer = writer.await?;
@@ -143,13 +147,12 @@ impl Store {
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
-        let (forecast, hashes) = (Arc::default(), Arc::default());
         let store = Self {
             dir,
             writer,
             readers,
-            forecast,
-            hashes,
+            forecasts: Arc::default(),
+            hashes: Arc::default(),
             removals: removal::Removals::default(),
             damage: Arc::default(),
             schema: schema.newest(),
@@ -164,6 +167,9 @@ impl Store {
             store.note_time(Duration::ZERO).await?;
             identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
             store.write_marker().await?;
+            if purpose == (Purpose::Serve { accept_database: true }) {
+                store.recount_totals().await?;
+            }
             store.advance_generation().await?;
         }
         Ok(store)
@@ -209,7 +215,7 @@ impl Store {
         Ok(())
     }
 
-    /// What is wrong with the database, if the last look has found something.
+    /// Damage of the database, if the last check found any.
     pub fn database_damage(&self) -> Option<String> {
         self.damage.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

@@ -1,4 +1,4 @@
-//! All stored files of which a hash is on record, page by page: blobs by their hashes, then results by job.
+//! All stored files with a recorded hash, page by page: blobs by hash, then results by job.
 
 use std::path::PathBuf;
 
@@ -14,7 +14,7 @@ use engine::job::{JobId, PartialId, Sha256};
 /// Records of a page.
 const PAGE: i64 = 500;
 
-/// Where a file belongs.
+/// Place of a stored file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Place {
     Blob(Sha256),
@@ -44,7 +44,7 @@ struct ResultRow {
 from_row!(ResultRow, row => { job, snapshot, name, sha256 });
 
 impl Record {
-    /// Where it lies below a data folder.
+    /// The path of the file below a data folder.
     pub(super) fn path(&self, dir: &DataDir) -> PathBuf {
         match &self.place {
             Place::Blob(sha256) => dir.blob(sha256),
@@ -104,7 +104,7 @@ pub(super) async fn page(
     Ok(results.into_iter().map(record).collect())
 }
 
-/// Whether a file is still on record as it was.
+/// True if a file has an unchanged record.
 pub(super) async fn stands(connection: &mut SqliteConnection, record: &Record) -> Result<bool> {
     let query = match &record.place {
         Place::Blob(sha256) => sql!("SELECT 1 FROM blobs WHERE sha256 = ?", [sha256]),
@@ -123,7 +123,7 @@ pub(super) async fn partials(connection: &mut SqliteConnection) -> Result<Vec<(P
     sql_as!(partials).fetch_all(connection).await
 }
 
-/// The snapshots of a job of which a file is known to be damaged, [`WHOLE_JOB`] among them.
+/// The snapshots of a job with a damaged file; [`WHOLE_JOB`] stands for the files of the whole job.
 pub(super) async fn damaged_snapshots(
     connection: &mut SqliteConnection,
     job: JobId,

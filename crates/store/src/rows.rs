@@ -33,7 +33,7 @@ pub struct Span {
     pub before: Option<Timestamp>,
 }
 
-/// Which things a list holds that belong to calibrations.
+/// Filter of a list of things that belong to calibrations.
 #[derive(Debug, Clone, Copy)]
 pub struct Filter<Id> {
     pub calibration: Option<CalibrationId>,
@@ -54,7 +54,7 @@ macro_rules! listed_text {
         concat!(
             "SELECT * FROM ",
             $place,
-            " lab = ?1 AND (?2 IS NULL OR id < ?2)
+            " lab = ?1 AND id < coalesce(?2, 'g')
                AND (?3 IS NULL OR calibration = ?3)
                AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
              ORDER BY id DESC LIMIT ?4"
@@ -70,8 +70,8 @@ impl<Id: Into<ThingId>> Filter<Id> {
     }
 }
 
-/// A page of what belongs to calibrations and labs, newest first, with one more item than the page has, by `sql!`
-/// or `sql_as!`. The table is followed by WHERE and the conditions that it adds.
+/// A page of things of a lab that belong to calibrations, newest first, with one item more than the page shows, by
+/// `sql!` or `sql_as!`. The table is followed by WHERE and the conditions that it adds.
 macro_rules! listed {
     ($statement:ident, $place:expr, $lab:expr, $filter:expr, $limit:expr) => {
         $statement!(
@@ -90,7 +90,7 @@ macro_rules! listed {
 
 pub(super) use {listed, listed_text};
 
-/// What a new row refers to.
+/// A reference of a new row.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Reference {
     Blob(Sha256),
@@ -99,9 +99,8 @@ pub(super) enum Reference {
     Model(ModelId),
 }
 
-/// Refuses a row that refers to what is not there: it may have been deleted a moment ago. SQLite
-/// would refuse it too, but does not say which of its references is broken. With the writer's lock
-/// held, what is there stays there.
+/// Refuses a row with a missing reference: it may have been deleted a moment ago. SQLite would refuse it too, but does
+/// not say which of its references is broken. The writer's lock keeps others from deleting it afterwards.
 pub(super) async fn require(
     connection: &mut SqliteConnection,
     references: &[Reference],

@@ -1,7 +1,7 @@
 //! Files on their way into the store: written under a temporary name, hashed, brought to the disk.
 //!
-//! Whoever writes holds a lock on the file, so that the sweep can tell it from what a dead process
-//! left. What is dropped before it is stored is removed.
+//! A writer holds a lock on its file, so that the sweep can distinguish it from the files of dead processes. A file
+//! that is dropped before it is stored is removed.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -64,8 +64,8 @@ impl Store {
         Ok(StagedPath(Temporary::new(path, lock)?))
     }
 
-    /// A second name for a file that is there, on its way into the store; `lock` holds the file's lock
-    /// already. Blocks on the disk.
+    /// A second name for an existing file, on its way into the store; `lock` holds the file's lock already. Blocks on
+    /// the disk.
     pub(super) fn staged_link(&self, original: &Path, lock: File) -> Result<StagedPath> {
         let path = self.temporary_path();
         fs::hard_link(original, &path).map_err(StoreError::io("link", &path))?;
@@ -73,9 +73,9 @@ impl Store {
     }
 
     /// Takes a file or a folder out of its place, at once and as a whole; its bytes go in the background, as large
-    /// files take long and others wait for the lock of the database. It may be gone already.
-    /// What the version before an update knows is kept for some days: what was there at `since`, or has not changed
-    /// since it was made.
+    /// files take long and others wait for the lock of the database. It may be gone already. Files that the version
+    /// before an update knows are kept for some days: those that existed at `since`, or have not changed since they
+    /// were made.
     pub(super) async fn discard(&self, place: PathBuf, since: Option<Timestamp>) -> Result<()> {
         let rest = self.temporary_path();
         let (moved, root) = (rest.clone(), self.dir().clone());
@@ -160,7 +160,7 @@ impl Write for BlobWriter {
 pub struct StagedPath(Temporary);
 
 impl StagedPath {
-    /// The path to write to. The file is there and empty; it must not be replaced by another one.
+    /// The path to write to. The file exists and is empty; it must not be replaced by another one.
     pub fn path(&self) -> &Path {
         &self.0.path
     }
@@ -196,7 +196,7 @@ impl StagedBlob {
         self.size
     }
 
-    /// Where it lies until it is stored.
+    /// The path of the file until it is stored.
     pub fn path(&self) -> &Path {
         &self.temporary.path
     }
@@ -207,8 +207,8 @@ impl StagedBlob {
         if let Some(folder) = place.parent() {
             dir::make_dir_durably(folder)?;
         }
-        // A file that is there has the same bytes, or is damaged. It is removed in the background: the time that
-        // this takes would reveal that another lab had sent the same bytes.
+        // An existing file has the same bytes, or is damaged. It is removed in the background: the time that this takes
+        // would reveal that another lab had sent the same bytes.
         let old = self.temporary.path.with_extension("old");
         let replaced = fs::hard_link(place, &old).is_ok();
         dir::rename_durably(&self.temporary.path, place)?;
@@ -220,8 +220,7 @@ impl StagedBlob {
     }
 }
 
-/// A temporary folder in which a task writes its result files. Whoever writes brings them to the
-/// disk.
+/// A temporary folder in which a task writes its result files. The writer syncs them.
 #[derive(Debug)]
 pub struct StagedDir(Temporary);
 

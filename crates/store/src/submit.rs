@@ -1,4 +1,4 @@
-//! What comes in: jobs, and requests for what is made of uploads. Each is written whole or not at all.
+//! Submission of jobs, and of requests that process uploads. Each is written whole or not at all.
 
 use std::str::FromStr;
 
@@ -14,7 +14,7 @@ use engine::job::{
 
 #[derive(Debug, Clone)]
 pub struct NewJob {
-    /// So many jobs may wait and run, with this one.
+    /// Jobs that may wait and run, this one included.
     pub most_jobs: u64,
     pub lab: Lab,
     pub spec: JobSpec,
@@ -32,8 +32,9 @@ pub struct NewRequest {
 
 impl Store {
     /// Records a request for something that is made of uploads, and puts their check in the queue.
-    /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused); [`StoreError::ManyChecks`](crate::StoreError::ManyChecks); [`StoreError::NotFound`](crate::StoreError::NotFound) if an upload or the
-    /// calibration is gone.
+    /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused);
+    /// [`StoreError::ManyChecks`](crate::StoreError::ManyChecks); [`StoreError::NotFound`](crate::StoreError::NotFound)
+    /// if an upload or the calibration was deleted.
     pub async fn request<Id>(
         &self,
         (lab, token): (&Lab, Option<TokenId>),
@@ -59,9 +60,9 @@ impl Store {
     }
 
     /// Accepts a job: the job and its tasks, or nothing.
-    /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused); [`StoreError::QueueFull`](crate::StoreError::QueueFull); [`StoreError::Quota`](crate::StoreError::Quota);
-    /// [`StoreError::NotFound`](crate::StoreError::NotFound) if
-    /// the measurement or the model is gone.
+    /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused);
+    /// [`StoreError::QueueFull`](crate::StoreError::QueueFull); [`StoreError::Quota`](crate::StoreError::Quota);
+    /// [`StoreError::NotFound`](crate::StoreError::NotFound) if the measurement or the model was deleted.
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted> {
         let mut transaction = self.write().await?;
         let key = new.key.as_ref();

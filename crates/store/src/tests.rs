@@ -9,6 +9,7 @@ mod movies;
 mod remote;
 mod sequences;
 mod statements;
+mod totals;
 mod turns;
 
 use std::io::Write;
@@ -21,7 +22,7 @@ use tempfile::TempDir;
 use super::{
     Checked, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob,
     NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError, Work,
-    WorkerEnd, WorkerPlace,
+    WorkerEnd, WorkerPlace, WorkerTakes,
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
@@ -83,7 +84,7 @@ impl Lab {
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();
-        store.worker_started(worker, 1, &WorkerPlace::default(), false).await.unwrap();
+        store.worker_started(worker, 1, &WorkerPlace::default(), WorkerTakes::All).await.unwrap();
         let asked = Submission::Calibration(asked);
         let passed = Checked::Masks(facts, upload(b"prepared masks"));
         let calibration = make(&store, worker, asked, passed).await;
@@ -231,7 +232,7 @@ impl Lab {
         self.store.complete(&task.lease, Completion { progress, record, product }).await.unwrap()
     }
 
-    /// Works until there is nothing to do, and says what was done.
+    /// Works until nothing is ready, and returns the kinds of the tasks.
     async fn work_off(&self) -> Vec<TaskKind> {
         let mut done = Vec::new();
         while let Some(task) = self.claim().await {
@@ -369,7 +370,7 @@ async fn no_task_goes_to_two_workers_at_once() {
 }
 
 #[tokio::test]
-async fn a_silent_worker_loses_its_task_and_what_it_says_later_is_refused() {
+async fn a_silent_worker_loses_its_task_and_later_reports_are_refused() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
     let late = lab.store.claim(lab.worker, Duration::from_millis(1)).await.unwrap().unwrap();
@@ -415,7 +416,7 @@ async fn cancel_stops_running_tasks_at_their_heartbeat() {
 }
 
 #[tokio::test]
-async fn cancel_ends_a_job_whose_last_worker_finished_or_died() {
+async fn cancel_ends_a_job_after_its_last_worker_finished_or_died() {
     let lab = Lab::new().await;
     for dies in [false, true] {
         let job = lab.submit(0).await;

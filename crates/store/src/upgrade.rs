@@ -1,5 +1,4 @@
-//! Bringing a database up to date: never without a copy of it as it was, and never one that a newer
-//! version has changed.
+//! Upgrade of a database: never without a copy of the old one, and never of one that a newer version has changed.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -57,9 +56,9 @@ pub(super) async fn save(dir: &DataDir, schema: i64) -> Result<Option<PathBuf>> 
     Ok(Some(copy))
 }
 
-/// Where a file or folder at `place` is kept when it is deleted, so that the last copy of the database can be gone back
-/// to; none if there was no update lately, or if it was made after the update. `since` is when it was made, if that is
-/// not the time of its last change.
+/// Path at which a deleted file or folder at `place` is kept for a return to the last copy of the database. `None` if
+/// there was no recent upgrade, or if the file was made after it. `since` is its time of creation, if that is not the
+/// time of its last change.
 pub(super) fn keep_as(
     dir: &DataDir,
     place: &Path,

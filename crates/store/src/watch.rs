@@ -1,4 +1,4 @@
-//! Whether anything in the database has changed, without asking it.
+//! Detection of changes in the database without a query.
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -8,13 +8,13 @@ use inotify::{EventStream, Inotify, WatchMask};
 
 use super::Store;
 
-/// A commit is written, synced, and only then seen by others, of which the kernel tells nothing: for `ECHO`
-/// after a write a look every `LOOK` finds it.
+/// A commit is written, synced, and only then visible to others, without an event of the kernel. So for `ECHO` after a
+/// write, the watcher looks every `LOOK`.
 const ECHO: Duration = Duration::from_millis(60);
 const LOOK: Duration = Duration::from_millis(6);
 
-/// Sees when any process writes to the database: each commit goes through a file beside it, of which the
-/// kernel tells.
+/// Detects writes of any process to the database: each commit goes through the write-ahead log, whose changes the
+/// kernel reports.
 #[derive(Debug)]
 pub struct Watcher {
     events: EventStream<Vec<u8>>,
@@ -26,10 +26,10 @@ impl Store {
     /// A watcher of this store.
     ///
     /// # Errors
-    /// If the kernel gives no more of them.
+    /// If the kernel allows no further watcher.
     pub fn watcher(&self) -> io::Result<Watcher> {
         let inotify = Inotify::init()?;
-        // The folder, since SQLite makes and removes its files. Blobs and results are in folders of their own.
+        // The folder, since SQLite makes and removes its files. Blobs and results are in other folders.
         inotify.watches().add(self.dir.root(), WatchMask::MODIFY)?;
         Ok(Watcher { events: inotify.into_event_stream(vec![0; 4096])?, written: None })
     }
@@ -47,7 +47,7 @@ impl Watcher {
         while let Some(seen) = event {
             seen?;
             self.written = Some(Instant::now());
-            // All that have come meanwhile are one.
+            // All events that are waiting count as one.
             event = self.events.next().now_or_never().flatten();
         }
         Ok(())

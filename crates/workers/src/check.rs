@@ -1,5 +1,5 @@
-//! The check of uploads: files are opened, validated, brought onto their scale and studied, and what passes becomes a
-//! prepared array. Blocks.
+//! Checks uploads: opens the files, validates and scales them, and writes those that pass as prepared arrays. All
+//! functions block.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -18,72 +18,76 @@ use formats::mat::SceneArray;
 use formats::{Axes, FormatError, Limits, StackInfo, StackWriter, planar};
 use store::{BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, StoreError};
 
-/// Why a check has no good end.
-enum End {
+/// Why a check did not pass.
+enum CheckError {
     Refused(Refusal),
     /// The machine failed, or the check was stopped.
     Failed(TaskError),
 }
 
-type Result<T, E = End> = std::result::Result<T, E>;
+type Result<T, E = CheckError> = std::result::Result<T, E>;
 
-impl From<Refusal> for End {
+impl From<Refusal> for CheckError {
     fn from(refusal: Refusal) -> Self {
         Self::Refused(refusal)
     }
 }
 
-impl From<IntakeError> for End {
+impl From<IntakeError> for CheckError {
     fn from(error: IntakeError) -> Self {
         Refusal::try_from(error).map_or_else(|error| Self::Failed(error.into()), Self::Refused)
     }
 }
 
-impl From<FormatError> for End {
+impl From<FormatError> for CheckError {
     fn from(error: FormatError) -> Self {
         IntakeError::from(error).into()
     }
 }
 
-impl From<StoreError> for End {
+impl From<StoreError> for CheckError {
     fn from(error: StoreError) -> Self {
         let refused = |code| Self::Refused(Refusal::new(code, error.to_string()));
         match &error {
             StoreError::Quota { .. } => refused(RefusalCode::QuotaExceeded),
-            StoreError::NoRoom { .. } => refused(RefusalCode::InsufficientStorage),
+            StoreError::NoRoom { .. } | StoreError::NoShare { .. } => {
+                refused(RefusalCode::InsufficientStorage)
+            }
             StoreError::Damaged { .. } => refused(RefusalCode::UploadDamaged),
-            full if full.is_disk_full() => Self::Refused(Refusal::disk_full()),
-            _ => Self::Failed(TaskError::Transport(error.into())),
+            _ => match error.disk_trouble() {
+                Some(trouble) => Self::Refused(Refusal::disk_trouble(trouble)),
+                None => Self::Failed(TaskError::Transport(error.into())),
+            },
         }
     }
 }
 
 /// Checks the uploads of a request.
-/// Errors: the machine failed, or the check was stopped; a refusal is an outcome like others.
+/// Errors: the machine failed, or the check was stopped. A refusal is returned as [`Checked::Refused`].
 pub(super) fn check(
     check: &Check,
     command: &ModelCommand,
     monitor: &Monitor,
 ) -> Result<Checked, TaskError> {
     let time = Duration::from_secs_f64(check.task.limits.seconds);
-    let desk = Desk { check, monitor, deadline: Instant::now() + time };
+    let running = Running { check, monitor, deadline: Instant::now() + time };
     let calibration = check.task.calibration.as_ref();
     let checked = match (&check.task.request.submission, calibration) {
         (Submission::Calibration(request), _) => match &request.captures {
-            Some(captures) => desk.captures(captures, request.mosaic),
-            None => desk.masks(request),
+            Some(captures) => running.captures(captures, request.mosaic),
+            None => running.masks(request),
         },
-        (Submission::Measurement(request), Some(masks)) => desk.measurement(request, masks),
-        (Submission::Model(request), Some(masks)) => desk.model(request, masks, command),
+        (Submission::Measurement(request), Some(masks)) => running.measurement(request, masks),
+        (Submission::Model(request), Some(masks)) => running.model(request, masks, command),
         (Submission::Measurement(_) | Submission::Model(_), None) => {
-            let detail = "the calibration is not there any more";
+            let detail = "the calibration has been deleted";
             Err(Refusal::new(RefusalCode::InvalidRequest, detail).at("/calibration").into())
         }
     };
     match checked {
         Err(_) if monitor.stopped() => Err(IntakeError::Stopped.into()),
-        Err(End::Failed(error)) => Err(error),
-        Err(End::Refused(refusal)) => {
+        Err(CheckError::Failed(error)) => Err(error),
+        Err(CheckError::Refused(refusal)) => {
             tracing::info!(?refusal, "refused");
             Ok(Checked::Refused(refusal))
         }
@@ -94,28 +98,28 @@ pub(super) fn check(
     }
 }
 
-/// What checks of all kinds need.
-struct Desk<'a> {
+/// A check in progress, with the context that all kinds of checks need.
+struct Running<'a> {
     check: &'a Check,
     monitor: &'a Monitor,
     deadline: Instant,
 }
 
-impl Desk<'_> {
+impl Running<'_> {
     fn limits(&self) -> Limits {
         Limits { max_file_bytes: self.check.task.limits.max_file_bytes, ..Limits::default() }
     }
 
-    /// Where an upload lies, if its bytes are those that were sent.
+    /// The path of an upload, after its bytes were compared with its hash.
     fn upload(&self, sha256: Sha256, pointer: &str) -> Result<PathBuf> {
-        let found = self.check.runtime.block_on(self.check.store.intact_blob(sha256));
-        found.map_err(|error| match End::from(error) {
-            End::Refused(refusal) => refusal.at(pointer).into(),
+        let path = self.check.runtime.block_on(self.check.store.intact_blob(sha256));
+        path.map_err(|error| match CheckError::from(error) {
+            CheckError::Refused(refusal) => refusal.at(pointer).into(),
             failed => failed,
         })
     }
 
-    /// The path of an upload, opened as a stack.
+    /// Opens an upload as a stack.
     fn open(
         &self,
         file: &std::path::Path,
@@ -128,8 +132,8 @@ impl Desk<'_> {
         Ok(source.open()?)
     }
 
-    /// Notes which share is read, on \[0,1\], and ends a check that was stopped or takes too long.
-    fn go_on(&self, share: f64) -> Result<(), FormatError> {
+    /// Records the share that was read, on \[0,1\]. Fails if the check was stopped or has passed its deadline.
+    fn proceed(&self, share: f64) -> Result<(), FormatError> {
         self.monitor.reach(TaskStage::Reading, share);
         let stop = |action, kind: ErrorKind| Err(FormatError::io(action)(kind.into()));
         if self.monitor.stopped() {
@@ -141,31 +145,31 @@ impl Desk<'_> {
         Ok(())
     }
 
-    /// Reserves disk space for `bytes` bytes, with room for `copies` of them for a while.
-    fn promise(&self, bytes: u64, copies: u64) -> Result<()> {
+    /// Reserves disk space for `bytes` bytes. While it works, the task needs room for `copies` of them.
+    fn reserve(&self, bytes: u64, copies: u64) -> Result<()> {
         let Check { store, lease, runtime, task } = self.check;
         let room = (copies, task.limits.min_free_bytes);
         Ok(runtime.block_on(store.promise(lease, bytes, room))?)
     }
 
-    /// The writer of a prepared array, if the disk has room for it and the lab and its token may keep it.
+    /// Creates a prepared array, if the disk and the quotas of the lab and its token have room for it.
     fn writer(&self, info: &StackInfo) -> Result<StackWriter<BlobWriter>> {
-        self.promise(planar::bytes(info), 1)?;
+        self.reserve(planar::bytes(info), 1)?;
         let writer = self.check.store.blob_writer()?;
         Ok(planar::writer(writer, info.frames, info.height, info.width)?)
     }
 
-    /// Looks at the headers of captures.
+    /// Checks the headers of captures.
     fn captures(&self, captures: &Captures, mosaic: Option<Mosaic>) -> Result<Checked> {
-        for (place, upload) in captures.uploads() {
-            self.upload(upload, &place)?;
-            self.go_on(0.0)?;
+        for (pointer, upload) in captures.uploads() {
+            self.upload(upload, &pointer)?;
+            self.proceed(0.0)?;
         }
         let dir = self.check.store.dir();
         let plan = plan(&captures.map(|upload| dir.blob(upload)), &self.limits())?;
         check_mosaic(mosaic, plan.size)?;
         // Two copies: as measured, and scaled.
-        self.promise(plan.bytes, 2)?;
+        self.reserve(plan.bytes, 2)?;
         Ok(Checked::Captures(plan.seconds))
     }
 
@@ -180,9 +184,9 @@ impl Desk<'_> {
         let (info, full_scale) = (opened.info, opened.full_scale.value());
         let mut writer = self.writer(&info)?;
         let mut done = 0.0;
-        let found = intake::masks(opened, |mask| {
+        let statistics = intake::masks(opened, |mask| {
             done += 1.0;
-            self.go_on(done / info.frames as f64)?;
+            self.proceed(done / info.frames as f64)?;
             writer.write_frame(mask)
         })?;
         check_mosaic(mosaic, (info.height, info.width))?;
@@ -196,16 +200,16 @@ impl Desk<'_> {
             height: info.height,
             width: info.width,
             full_scale,
-            mask_mean: found.mean,
-            dead_pixels: found.dead_pixels,
-            clipped_negatives: found.clipped_negative,
+            mask_mean: statistics.mean,
+            dead_pixels: statistics.dead_pixels,
+            clipped_negatives: statistics.clipped_negative,
             mosaic,
         };
         Ok(Checked::Masks(facts, writer.finish()?.finish()?))
     }
 
-    /// Writes a measurement with its dark subtracted and its full scale divided out, and checks it against the
-    /// masks of its calibration.
+    /// Subtracts the dark from a measurement, divides by its full scale, and checks it against the masks of its
+    /// calibration.
     fn measurement(
         &self,
         request: &MeasurementRequest,
@@ -218,9 +222,9 @@ impl Desk<'_> {
             dark.push(self.upload(*upload, &format!("/dark/{index}"))?);
         }
         let (masks, limits) = (&calibration.facts, self.limits());
-        let how = (request.array.as_ref(), request.axes, request.full_scale);
+        let layout = (request.array.as_ref(), request.axes, request.full_scale);
         let size = Some((masks.height, masks.width));
-        let opened = self.open(&file, SceneArray::Measurements, how, size)?;
+        let opened = self.open(&file, SceneArray::Measurements, layout, size)?;
         let (info, full_scale) = (opened.info, opened.full_scale.value());
         if (info.height, info.width) != (masks.height, masks.width) {
             let detail = format!(
@@ -234,17 +238,17 @@ impl Desk<'_> {
         let mut done = 0.0;
         let passed = intake::measurement(opened, &exposure, &limits, |y| {
             done += 1.0;
-            self.go_on(done / info.frames as f64)?;
+            self.proceed(done / info.frames as f64)?;
             writer.write_frame(y)
         })?;
         let staged = writer.finish()?.finish()?;
         let prepared = self.check.store.dir().blob(&calibration.prepared);
-        let both = (prepared.as_path(), staged.path());
-        let darkened = !exposure.dark.is_empty();
+        let arrays = (prepared.as_path(), staged.path());
+        let has_dark = !exposure.dark.is_empty();
         let mut warnings = passed.findings;
         let saturated = passed.saturated.as_deref();
-        warnings.extend(intake::judge(both, masks.mosaic, saturated, darkened, &limits)?);
-        let by_times = Sequence::from_camera(request.camera_fps, request.exposure_s, masks.frames);
+        warnings.extend(intake::judge(arrays, masks.mosaic, saturated, has_dark, &limits)?);
+        let estimated = Sequence::from_camera(request.camera_fps, request.exposure_s, masks.frames);
         let facts = NewMeasurement {
             name: request.name,
             calibration: request.calibration,
@@ -259,14 +263,14 @@ impl Desk<'_> {
             full_scale,
             camera_fps: request.camera_fps,
             exposure_s: request.exposure_s,
-            sequence: request.sequence.unwrap_or(by_times),
+            sequence: request.sequence.unwrap_or(estimated),
             dark: request.dark,
             warnings,
         };
         Ok(Checked::Measurement(facts, staged))
     }
 
-    /// Tries a network in a separate process.
+    /// Runs a network once, in a separate process.
     fn model(
         &self,
         request: &ModelRequest,
@@ -275,11 +279,11 @@ impl Desk<'_> {
     ) -> Result<Checked> {
         let file = self.upload(request.file, "/file")?;
         let facts = model_check::run(command, &file, &masks.facts, self.deadline, self.monitor);
-        Ok(Checked::Model(facts.map_err(End::Failed)??))
+        Ok(Checked::Model(facts.map_err(CheckError::Failed)??))
     }
 }
 
-/// Refuses the mosaic of a sensor with an odd number of rows or columns.
+/// Refuses a mosaic on pictures with an odd number of rows or columns.
 fn check_mosaic(mosaic: Option<Mosaic>, (height, width): (usize, usize)) -> Result<()> {
     if mosaic.is_none() || (height.is_multiple_of(2) && width.is_multiple_of(2)) {
         return Ok(());

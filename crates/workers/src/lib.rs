@@ -1,5 +1,5 @@
-//! A worker: one loop (claim a task, perform it, renew its lease, complete it) and the transports it reaches the
-//! queue through: the store of the same machine, or NATS.
+//! The worker: a loop that claims a task, performs it, renews its lease and completes it. It reaches the queue
+//! through a transport: the store of the same machine, or NATS.
 
 mod check;
 mod local;

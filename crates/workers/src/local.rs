@@ -1,4 +1,4 @@
-//! The store of the same machine, as a worker sees it.
+//! The transport of a worker on the machine of the store.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -29,18 +29,18 @@ use store::{
     Store, StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
 };
 
-/// The store, and who works for it.
+/// The store, and the worker that claims from it.
 #[derive(Debug, Clone)]
 pub struct Local {
     store: Store,
     worker: WorkerId,
     claimant: Claimant<'static>,
-    /// None until it is first needed.
+    /// Opened at the first use.
     watcher: Arc<Mutex<Option<Watcher>>>,
 }
 
 impl Local {
-    /// For a worker of this name, which takes the tasks that this claimant may have.
+    /// A transport for the worker `worker`, which takes the tasks that `claimant` may claim.
     pub fn new(store: Store, worker: WorkerId, claimant: Claimant<'static>) -> Self {
         Self { store, worker, claimant, watcher: Arc::default() }
     }
@@ -49,7 +49,7 @@ impl Local {
         Arrays { masks: (self.path(masks), masks), snapshots: (self.path(snapshots), snapshots) }
     }
 
-    /// All that a task needs.
+    /// Collects everything that a task needs.
     fn input(&self, work: Work, kind: TaskKind, lease: Lease) -> Result<TaskInput, TaskError> {
         match work {
             Work::Job(task) => self.step(&task, kind, lease.attempt),
@@ -66,7 +66,7 @@ impl Local {
                     masks: Box::new(self.store.blob_writer().map_err(failed)?),
                 }),
                 None => {
-                    let masks = task.masks.ok_or_else(|| not_possible(kind))?;
+                    let masks = task.masks.ok_or_else(|| missing_input(kind))?;
                     Ok(TaskInput::Report(self.path(masks)))
                 }
             },
@@ -119,12 +119,12 @@ impl Local {
                 folder: folder()?,
             },
             TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
-                return Err(not_possible(kind).into());
+                return Err(missing_input(kind).into());
             }
         })
     }
 
-    /// What was made, as the store takes it. Blocks on the disk.
+    /// Converts an output into a product of the store. Blocks on the disk.
     fn product(&self, output: Output) -> Result<Product, TransportError> {
         Ok(match output {
             Output::Record => Product::Record,
@@ -137,7 +137,7 @@ impl Local {
         })
     }
 
-    /// Frames \[B,h,w\] as a prepared array.
+    /// Writes frames \[B,h,w\] as a prepared array.
     fn staged(&self, frames: ArrayView3<'_, f32>) -> Result<StagedBlob, TransportError> {
         let (count, height, width) = frames.dim();
         let mut writer = planar::writer(self.store.blob_writer()?, count, height, width)?;
@@ -158,26 +158,26 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        let (place, light) = (WorkerPlace::default(), self.claimant == Claimant::Light);
-        Ok(self.store.worker_started(self.worker, std::process::id(), &place, light).await?)
+        let (location, takes) = (WorkerPlace::default(), self.claimant.takes());
+        Ok(self.store.worker_started(self.worker, std::process::id(), &location, takes).await?)
     }
 
-    async fn seen(&self) -> Result<(), TransportError> {
+    async fn report_alive(&self) -> Result<(), TransportError> {
         Ok(self.store.worker_seen(self.worker).await?)
     }
 
     async fn idle(&self, time: Duration) {
-        let mut place = self.watcher.lock().await;
+        let mut slot = self.watcher.lock().await;
         let changed = async {
-            let watcher = match &mut *place {
+            let watcher = match &mut *slot {
                 Some(watcher) => watcher,
                 none => none.insert(self.store.watcher()?),
             };
             watcher.changed(time).await
         };
         if let Err(error) = changed.await {
-            tracing::warn!(%error, "changes of the database can't be seen");
-            *place = None;
+            tracing::warn!(%error, "changes of the database can't be watched");
+            *slot = None;
             tokio::time::sleep(time).await;
         }
     }
@@ -201,8 +201,8 @@ impl Transport for Local {
                 tracing::info_span!("task", job = %work.job, kind = name, task = %id)
             }
         };
-        let here = self.clone();
-        let input = move || here.input(work, kind, lease);
+        let transport = self.clone();
+        let input = move || transport.input(work, kind, lease);
         let input = tokio::task::spawn_blocking(input).await?;
         Ok(Some(Claim { lease, span, cost, input }))
     }
@@ -218,8 +218,8 @@ impl Transport for Local {
 
     async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError> {
         let Done { progress, record, output } = done;
-        let here = self.clone();
-        let product = tokio::task::spawn_blocking(move || here.product(output)).await??;
+        let transport = self.clone();
+        let product = tokio::task::spawn_blocking(move || transport.product(output)).await??;
         Ok(self.store.complete(lease, Completion { progress, record, product }).await?)
     }
 
@@ -254,12 +254,12 @@ fn failed(error: StoreError) -> TaskError {
     TaskError::Transport(error.into())
 }
 
-fn not_possible(kind: TaskKind) -> PipelineError {
-    let problem = format!("a {} has nothing to begin with", kind.into_str());
+fn missing_input(kind: TaskKind) -> PipelineError {
+    let problem = format!("the {} task has no input", kind.into_str());
     PipelineError::Record { what: "task", problem }
 }
 
-/// A record that this program wrote.
+/// Reads a record that this program wrote.
 fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, PipelineError> {
     T::deserialize(record).map_err(PipelineError::record(what))
 }
@@ -283,13 +283,13 @@ fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
     })
 }
 
-/// What the pilot found; none before it, and for a job without one.
+/// The pilot's record. It is `None` before the pilot has run, and for a job without a pilot.
 fn pilot(task: &JobTask) -> Result<Option<PilotRecord>, PipelineError> {
     parsed("pilot", task.pilot.as_ref().unwrap_or(&Value::Null))
 }
 
-/// A tile of the run of a job that begins with this snapshot, from the plans and the records of the tasks
-/// before it.
+/// Tile `index` of the run that begins with snapshot `first`. It follows from the job's plans and the records of
+/// its earlier tasks.
 pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, PipelineError> {
     let plan = task.spec.tile_plan()?;
     let tile = plan.tile(index as usize).ok_or_else(|| PipelineError::Record {
@@ -298,19 +298,20 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
     })?;
     let pilot = pilot(task)?;
     let runs = task.spec.sequence_plan()?;
-    let begins = |run: &Range<usize>| run.start == first as usize;
-    let run = runs.runs().iter().position(begins).ok_or_else(|| PipelineError::Record {
+    let begins_here = |run: &Range<usize>| run.start == first as usize;
+    let run = runs.runs().iter().position(begins_here).ok_or_else(|| PipelineError::Record {
         what: "task",
         problem: format!("no run begins with snapshot {first}"),
     })?;
     let start = runs.runs()[run].start;
     let pieces = runs.pieces(&pilot.as_ref().map(PilotRecord::cuts).unwrap_or_default());
-    let own = pieces.into_iter().filter(|piece| piece.run == run).map(|piece| piece.snapshots);
+    let run_pieces =
+        pieces.into_iter().filter(|piece| piece.run == run).map(|piece| piece.snapshots);
     Ok(TileTask {
         masks: task.calibration.prepared,
         measurement: task.measurement.prepared,
         snapshots: first..first + runs.runs()[run].len() as u32,
-        pieces: own.map(|piece| piece.start - start..piece.end - start).collect(),
+        pieces: run_pieces.map(|piece| piece.start - start..piece.end - start).collect(),
         tile,
         white: white(task.prepared.as_ref())?,
         schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),
@@ -348,7 +349,8 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
     })
 }
 
-/// What the other tasks of a job have left for its manifest, which `attempt` is to write.
+/// Collects the records of a job's other tasks for its manifest. `attempt` is the number of the manifest task's
+/// attempt.
 fn tasks(records: &[TaskRecord], attempt: u32) -> Result<JobTasks, PipelineError> {
     let mut tasks =
         JobTasks { snapshots: Vec::new(), seconds: Vec::new(), attempts: u64::from(attempt) };

@@ -1,5 +1,5 @@
-//! The check of a network, in a separate process (`sci-recon check-model`): a stranger's file reaches native code,
-//! which may crash, hang, or take all memory.
+//! Checks a network in a separate process (`sci-recon check-model`). A stranger's file reaches native code, which
+//! may crash, hang, or take all memory.
 
 use std::io::Read;
 use std::os::unix::process::ExitStatusExt;
@@ -14,19 +14,19 @@ use engine::job::{ModelFacts, ModelVerdict, without_paths};
 use engine::pipeline::progress::Monitor;
 use store::NewCalibration;
 
-/// Time between looks at the process.
-const LOOK: Duration = Duration::from_millis(20);
-/// Characters of a reason that are shown.
-const REASON: usize = 2000;
+/// Time between polls of the process.
+const POLL: Duration = Duration::from_millis(20);
+/// Longest reason that is shown, in characters.
+const MAX_REASON: usize = 2000;
 
-/// How the process ended, and what it wrote.
-struct Ended {
+/// The exit status and the output of a process.
+struct Exit {
     status: ExitStatus,
     stdout: Vec<u8>,
     stderr: Vec<u8>,
 }
 
-/// Checks whether an upload is a network for these masks, and runs it once, until `deadline`.
+/// Checks whether an upload is a network for these masks, and runs it once. Kills the process at `deadline`.
 /// Errors: the process can't be started, or the check was stopped.
 pub(super) fn run(
     command: &ModelCommand,
@@ -36,13 +36,13 @@ pub(super) fn run(
     monitor: &Monitor,
 ) -> Result<Result<ModelFacts, Refusal>, TaskError> {
     let start = Instant::now();
-    let ended = watched(prepared(command, file, masks), deadline, monitor)
+    let exit = run_until(command_line(command, file, masks), deadline, monitor)
         .map_err(|error| TaskError::Transport(error.into()))?;
-    // The names in a network are any text of any length.
-    let cut = |why: String| without_paths(&why).chars().take(REASON).collect::<String>();
+    // A network may contain names of any length.
+    let cut = |why: String| without_paths(&why).chars().take(MAX_REASON).collect::<String>();
     let refused =
         |why: String| Ok(Err(Refusal::new(RefusalCode::InvalidContent, cut(why)).at("/file")));
-    let Some(Ended { status, stdout, stderr }) = ended else {
+    let Some(Exit { status, stdout, stderr }) = exit else {
         if monitor.stopped() {
             return Err(IntakeError::Stopped.into());
         }
@@ -54,7 +54,9 @@ pub(super) fn run(
             Some(bytes) => format!("; it may take {} MiB of memory", bytes >> 20),
             None => String::new(),
         };
-        return refused(format!("the network ended the process that tried it ({status}){limit}"));
+        return refused(format!(
+            "the network crashed the process that checked it ({status}){limit}"
+        ));
     }
     match serde_json::from_slice(&stdout) {
         Ok(ModelVerdict::Fits(facts)) => Ok(Ok(facts)),
@@ -62,13 +64,13 @@ pub(super) fn run(
         Err(_) => {
             let output = String::from_utf8_lossy(&stderr);
             tracing::error!(%output, %status, "a network can't be checked");
-            let detail = "the service can't run networks now; its log says why";
+            let detail = "the service can't run networks now; its log has the reason";
             Ok(Err(Refusal::new(RefusalCode::Unavailable, detail)))
         }
     }
 }
 
-fn prepared(model: &ModelCommand, file: &Path, masks: &NewCalibration) -> Command {
+fn command_line(model: &ModelCommand, file: &Path, masks: &NewCalibration) -> Command {
     let mut command = Command::new(&model.program);
     command.args(&model.check).arg(file);
     // Each of the four sub-images of a mosaic goes through the network.
@@ -77,24 +79,24 @@ fn prepared(model: &ModelCommand, file: &Path, masks: &NewCalibration) -> Comman
     for (name, value) in [("--frames", masks.frames), ("--height", height), ("--width", width)] {
         command.arg(name).arg(value.to_string());
     }
-    // Its standard input ends with this process.
+    // The process ends when its standard input closes, which happens at the latest when this process ends.
     command.arg("--supervised").env_remove("SCI_RECON_CONFIG");
     command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }
 
-/// Runs a process to its end; none if it was killed at the deadline, or as nobody wants it any more.
-fn watched(
+/// Runs a process to its end. Returns `None` if it was killed at the deadline or because the check was stopped.
+fn run_until(
     mut command: Command,
     deadline: Instant,
     monitor: &Monitor,
-) -> std::io::Result<Option<Ended>> {
+) -> std::io::Result<Option<Exit>> {
     let mut child = command.spawn()?;
     let (mut output, mut errors) = (child.stdout.take(), child.stderr.take());
     std::thread::scope(|scope| {
         let read = |pipe: Option<&mut dyn Read>| {
             let mut bytes = Vec::new();
-            // What came before an error is good enough.
+            // The bytes before a read error suffice.
             pipe.map(|pipe| pipe.read_to_end(&mut bytes));
             bytes
         };
@@ -103,7 +105,7 @@ fn watched(
         let status = loop {
             match child.try_wait() {
                 Ok(None) if monitor.stopped() || Instant::now() >= deadline => break Ok(None),
-                Ok(None) => std::thread::sleep(LOOK),
+                Ok(None) => std::thread::sleep(POLL),
                 ended => break ended,
             }
         };
@@ -114,6 +116,6 @@ fn watched(
         let bytes =
             |thread: std::thread::ScopedJoinHandle<'_, Vec<u8>>| thread.join().unwrap_or_default();
         let (stdout, stderr) = (bytes(stdout), bytes(stderr));
-        Ok(status?.map(|status| Ended { status, stdout, stderr }))
+        Ok(status?.map(|status| Exit { status, stdout, stderr }))
     })
 }

@@ -1,9 +1,9 @@
-//! Networks of users, each in a process of its own (`sci-recon run-model`): native code works there on what a
-//! stranger has sent, so it sees the files of no lab, and its end is not that of the worker.
+//! Runs each network of a user in a separate process (`sci-recon run-model`). Native code handles a stranger's
+//! file there: the process sees no lab's files, and a crash does not end the worker.
 //!
-//! From the worker come the length and the bytes of the ONNX file, then, for each run, the sides B, H and W, the
-//! measurement and the masks. Back comes a line of JSON, [`Answer`], and after [`Answer::Frames`] the frames.
-//! Numbers are as this machine has them.
+//! The worker sends the length and the bytes of the ONNX file. For each run it sends the sides B, H and W, the
+//! measurement and the masks. The process answers with a line of JSON, [`Answer`]; the frames follow
+//! [`Answer::Frames`]. Numbers have this machine's byte order.
 
 use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -23,10 +23,10 @@ use engine::pipeline::usage::{cpu_seconds_of, kills_for_memory, peak_rss_of};
 use reconstruction::ReconError;
 use reconstruction::learned::{SnapshotNetwork, all_finite};
 
-/// Time between looks whether a run is still wanted, and at the memory that it takes.
-const LOOK: Duration = Duration::from_millis(100);
-/// Bytes of an answer's line that are read.
-const LINE: u64 = 1 << 16;
+/// Time between checks for a cancellation and of the memory in use.
+const POLL: Duration = Duration::from_millis(100);
+/// Longest line of an answer, in bytes.
+const MAX_LINE: u64 = 1 << 16;
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -36,20 +36,20 @@ enum Answer {
     Failed(String),
 }
 
-/// How such a process is started.
+/// The command lines that run and check networks.
 #[derive(Debug, Clone)]
 pub struct ModelCommand {
-    /// This program.
+    /// Path of this program.
     pub program: PathBuf,
     /// The arguments that run a network.
     pub run: Vec<OsString>,
-    /// The arguments that check one, without its file and the size of the masks.
+    /// The arguments that check a network, without its file and the size of the masks.
     pub check: Vec<OsString>,
-    /// The most memory that it may take, in bytes.
+    /// Memory limit of the process in bytes.
     pub memory_bytes: Option<u64>,
 }
 
-/// The process of the network that was last asked for.
+/// The process of the network that was used last.
 pub(super) struct ModelProcesses {
     command: ModelCommand,
     running: Option<ModelProcess>,
@@ -60,22 +60,22 @@ impl ModelProcesses {
         Self { command, running: None }
     }
 
-    /// How such a process is started.
+    /// The command lines that run and check networks.
     pub(super) fn command(&self) -> &ModelCommand {
         &self.command
     }
 
-    /// A process with this network, which is kept until another one is asked for, or none: memory is
-    /// planned for one thing at a time.
+    /// Returns a process with this network, and ends the process of any other: memory is planned for one at a time.
+    /// Without a file, no process remains.
     pub(super) fn only(
         &mut self,
         file: Option<&ModelFile>,
         monitor: &Monitor,
     ) -> Result<Option<&mut ModelProcess>, PipelineError> {
-        let warm = self.running.take();
+        let running = self.running.take();
         let Some(file) = file else { return Ok(None) };
-        let warm = warm.filter(|process| process.model == file.sha256());
-        let process = match warm.and_then(ModelProcess::alive) {
+        let running = running.filter(|process| process.model == file.sha256());
+        let process = match running.and_then(ModelProcess::if_alive) {
             Some(process) => process,
             None => ModelProcess::start(&self.command, file, monitor)?,
         };
@@ -89,9 +89,9 @@ pub(super) struct ModelProcess {
     child: Child,
     input: ChildStdin,
     output: BufReader<ChildStdout>,
-    /// The most that it may take, and what was seen of it so far.
+    /// Memory limit in bytes, and the largest use that was observed.
     memory: (Option<u64>, u64),
-    /// Kills by the kernel for want of memory before it began.
+    /// The kernel's count of out-of-memory kills when the process started.
     kills: Option<u64>,
     /// See [`Self::bill`].
     billed: f64,
@@ -109,7 +109,7 @@ impl ModelProcess {
         };
         let mut child = Command::new(&command.program)
             .args(&command.run)
-            // All that it needs has been told.
+            // The arguments carry all settings.
             .env_remove("SCI_RECON_CONFIG")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -134,25 +134,24 @@ impl ModelProcess {
         Ok(process)
     }
 
-    /// The same, unless it has ended.
-    fn alive(mut self) -> Option<Self> {
+    /// Returns the process if it still runs.
+    fn if_alive(mut self) -> Option<Self> {
         matches!(self.child.try_wait(), Ok(None)).then_some(self)
     }
 
-    /// Processor time that it has used since this was last asked, in seconds, and its largest resident memory,
-    /// in bytes.
+    /// Returns the processor time in seconds since the last call, and the largest resident memory in bytes.
     pub(super) fn bill(&mut self) -> (f64, u64) {
         let process = self.child.id();
         let now = cpu_seconds_of(process);
         (now - std::mem::replace(&mut self.billed, now), peak_rss_of(process))
     }
 
-    /// The network in it, whose runs end as soon as the monitor says so.
+    /// The network of the process. Stopping `monitor` ends its runs.
     pub(super) fn watched<'a>(&'a mut self, monitor: &'a Monitor) -> impl SnapshotNetwork + 'a {
         Watched { process: self, monitor }
     }
 
-    /// Exchanges something with the process, and kills it if it is wanted no more.
+    /// Exchanges messages with the process, and kills it if the monitor is stopped.
     fn ask<T>(
         &mut self,
         monitor: &Monitor,
@@ -166,7 +165,7 @@ impl ModelProcess {
         let exchanged = std::thread::scope(|scope| {
             scope.spawn(move || {
                 // Neither native code nor a pipe can be asked to stop.
-                while ended.recv_timeout(LOOK) == Err(RecvTimeoutError::Timeout) {
+                while ended.recv_timeout(POLL) == Err(RecvTimeoutError::Timeout) {
                     *peak = peak_rss_of(child.id()).max(*peak);
                     if monitor.stopped() {
                         let _ = child.kill();
@@ -180,30 +179,29 @@ impl ModelProcess {
         monitor.check()?;
         match exchanged {
             Ok(Ok(value)) => Ok(value),
-            Ok(Err(why)) => Err(ReconError::Runtime(why).into()),
-            Err(error) => Err(ReconError::Runtime(self.death(&error)).into()),
+            Ok(Err(reason)) => Err(ReconError::Runtime(reason).into()),
+            Err(error) => Err(ReconError::Runtime(self.crash_report(&error)).into()),
         }
     }
 
-    /// Why it does not answer.
-    fn death(&mut self, error: &io::Error) -> String {
-        // One that has closed its pipes and lives is of no use.
+    /// Explains why the process does not answer.
+    fn crash_report(&mut self, error: &io::Error) -> String {
+        // The process may have closed its pipes and still run.
         let _ = self.child.kill();
-        let how = match self.child.wait() {
+        let status = match self.child.wait() {
             Ok(status) => status.to_string(),
             Err(_) => error.to_string(),
         };
         let (limit, peak) = self.memory;
-        let starved = match kills_for_memory() > self.kills {
+        let out_of_memory = match kills_for_memory() > self.kills {
             true => "; the machine had no memory left for it",
             false => "",
         };
-        let limit = limit.map_or_else(String::new, |limit| {
-            format!(" of the {} MiB that it may take", limit >> 20)
-        });
+        let limit =
+            limit.map_or_else(String::new, |limit| format!(", its limit is {} MiB", limit >> 20));
         format!(
-            "the network ended the process that ran it ({how}){starved}; its memory was seen at {} \
-             MiB{limit}",
+            "the network crashed the process that ran it ({status}){out_of_memory}; the process used {} \
+            MiB of memory{limit}",
             peak >> 20
         )
     }
@@ -211,7 +209,7 @@ impl ModelProcess {
 
 impl Drop for ModelProcess {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // Fails if the process has already ended.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -236,41 +234,41 @@ impl SnapshotNetwork for Watched<'_> {
                 let values = values.ok_or(io::ErrorKind::InvalidInput)?;
                 input.write_all(bytemuck::cast_slice(values))?;
             }
-            if let Err(why) = answer(output)? {
-                return Ok(Err(why));
+            if let Err(reason) = answer(output)? {
+                return Ok(Err(reason));
             }
-            let mut made = Array3::zeros(masks.raw_dim());
-            if let Some(made) = made.as_slice_mut() {
-                output.read_exact(bytemuck::cast_slice_mut(made))?;
+            let mut frames = Array3::zeros(masks.raw_dim());
+            if let Some(values) = frames.as_slice_mut() {
+                output.read_exact(bytemuck::cast_slice_mut(values))?;
             }
-            Ok(Ok(made))
+            Ok(Ok(frames))
         });
-        let made = ran.map_err(|error| match error {
+        let frames = ran.map_err(|error| match error {
             PipelineError::Stopped => ReconError::Cancelled,
             other => ReconError::Runtime(other.to_string()),
         })?;
-        // It is the word of a stranger's code.
-        all_finite(&made)?;
-        Ok(made)
+        // The frames come from a stranger's network.
+        all_finite(&frames)?;
+        Ok(frames)
     }
 }
 
-/// Whether it went well, or why not.
+/// Reads an answer. The inner error is the reason that the network gave.
 fn answer(output: &mut impl BufRead) -> io::Result<Result<(), String>> {
     let mut line = String::new();
-    output.by_ref().take(LINE).read_line(&mut line)?;
+    output.by_ref().take(MAX_LINE).read_line(&mut line)?;
     match serde_json::from_str(&line) {
         Ok(Answer::Loaded | Answer::Frames) => Ok(Ok(())),
-        Ok(Answer::Failed(why)) => Ok(Err(why)),
+        Ok(Answer::Failed(reason)) => Ok(Err(reason)),
         Err(error) => Err(io::Error::new(io::ErrorKind::InvalidData, error)),
     }
 }
 
-/// The other side: answers on standard output what comes on standard input, until its end.
+/// Runs in the network's process: reads tasks from standard input until it ends, and answers on standard output.
 /// Errors: standard output is closed.
 pub fn answer_worker(source: &NetworkSource) -> io::Result<()> {
     let (sender, tasks) = mpsc::sync_channel(0);
-    // The end of the input, which a killed worker leaves, ends this process whatever the network is doing.
+    // The input ends when the worker dies. Then this process ends too, whatever the network is doing.
     std::thread::spawn(move || {
         let _ = read(&mut io::stdin().lock(), &sender);
         std::process::exit(0);
@@ -307,14 +305,14 @@ enum Task {
     Run(Array2<f32>, Array3<f32>),
 }
 
-/// Reads what the worker sends, one thing after the other, for as long as it does.
+/// Reads the network and then the runs that the worker sends, until the input ends.
 fn read(input: &mut impl Read, tasks: &mpsc::SyncSender<Task>) -> io::Result<()> {
     let mut length = [0; 1];
     input.read_exact(bytemuck::cast_slice_mut::<u64, u8>(&mut length))?;
     let mut content = Vec::new();
     input.by_ref().take(length[0]).read_to_end(&mut content)?;
-    let gone = |_| io::Error::from(io::ErrorKind::BrokenPipe);
-    tasks.send(Task::Load(content)).map_err(gone)?;
+    let closed = |_| io::Error::from(io::ErrorKind::BrokenPipe);
+    tasks.send(Task::Load(content)).map_err(closed)?;
     loop {
         let mut sides = [0; 3];
         input.read_exact(bytemuck::cast_slice_mut::<u64, u8>(&mut sides))?;
@@ -324,7 +322,7 @@ fn read(input: &mut impl Read, tasks: &mpsc::SyncSender<Task>) -> io::Result<()>
         for values in [y.as_slice_mut(), masks.as_slice_mut()].into_iter().flatten() {
             input.read_exact(bytemuck::cast_slice_mut::<f32, u8>(values))?;
         }
-        tasks.send(Task::Run(y, masks)).map_err(gone)?;
+        tasks.send(Task::Run(y, masks)).map_err(closed)?;
     }
 }
 
@@ -341,7 +339,7 @@ mod tests {
     use reconstruction::ReconError;
     use reconstruction::learned::SnapshotNetwork;
 
-    /// One run of "networks" that are shell scripts, which take the length and the 8 bytes of the file first.
+    /// Runs a shell script in place of a network, after the length and the 8 bytes of the file were read.
     fn run(script: &str, monitor: &Monitor) -> Result<Array3<f32>, PipelineError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("network.onnx");
@@ -356,40 +354,40 @@ mod tests {
         Ok(process.watched(monitor).frames(Array2::ones((2, 2)).view(), masks.view())?)
     }
 
-    /// Sides, measurement and masks of a run.
-    const TAKEN: &str = r#"echo '"loaded"'; head -c 72 >/dev/null; "#;
+    /// Answers that the network is loaded, and reads the sides, the measurement and the masks of a run.
+    const READ_RUN: &str = r#"echo '"loaded"'; head -c 72 >/dev/null; "#;
 
     #[test]
-    fn frames_come_back() {
-        let script = format!("{TAKEN} echo '\"frames\"'; head -c 32 /dev/zero; exec cat");
+    fn a_network_returns_its_frames() {
+        let script = format!("{READ_RUN} echo '\"frames\"'; head -c 32 /dev/zero; exec cat");
         assert_eq!(run(&script, &Monitor::default()).unwrap(), Array3::<f32>::zeros((2, 2, 2)));
     }
 
     #[test]
-    fn whatever_it_answers_is_no_ones_but_its_own_fault() {
-        for (script, told) in [
+    fn a_bad_answer_is_reported_with_its_cause() {
+        for (script, expected) in [
             ("exit 3".to_owned(), "exit status: 3"),
             ("kill -ABRT $$".to_owned(), "SIGABRT"),
             ("echo '{\"failed\":\"no network\"}'; exec cat".to_owned(), "no network"),
-            ("echo '{'; exec cat".to_owned(), "of the 512 MiB"),
-            ("head -c 100000 /dev/zero; exec cat".to_owned(), "ended the process"),
-            (format!("{TAKEN} kill -SEGV $$"), "SIGSEGV"),
-            (format!("{TAKEN} echo '\"frames\"'; head -c 31 /dev/zero"), "exit status: 0"),
+            ("echo '{'; exec cat".to_owned(), "limit is 512 MiB"),
+            ("head -c 100000 /dev/zero; exec cat".to_owned(), "crashed the process"),
+            (format!("{READ_RUN} kill -SEGV $$"), "SIGSEGV"),
+            (format!("{READ_RUN} echo '\"frames\"'; head -c 31 /dev/zero"), "exit status: 0"),
             (
                 format!(
-                    "{TAKEN} echo '\"frames\"'; head -c 32 /dev/zero | tr '\\0' '\\377'; exec cat"
+                    "{READ_RUN} echo '\"frames\"'; head -c 32 /dev/zero | tr '\\0' '\\377'; exec cat"
                 ),
                 "finite",
             ),
         ] {
             let error = run(&script, &Monitor::default()).unwrap_err().to_string();
-            assert!(error.contains(told), "{script}: {error}");
+            assert!(error.contains(expected), "{script}: {error}");
         }
     }
 
     #[test]
-    fn a_run_ends_when_it_is_wanted_no_more() {
-        for script in ["exec sleep 60".to_owned(), format!("{TAKEN} exec sleep 60")] {
+    fn stopping_the_monitor_ends_a_run() {
+        for script in ["exec sleep 60".to_owned(), format!("{READ_RUN} exec sleep 60")] {
             let (monitor, start) = (Monitor::default(), Instant::now());
             let ended = std::thread::scope(|scope| {
                 scope.spawn(|| {

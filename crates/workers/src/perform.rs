@@ -1,4 +1,4 @@
-//! Does one task, whatever its kind.
+//! Performs one task of any kind.
 
 use ndarray::Array3;
 use serde::Serialize;
@@ -29,15 +29,15 @@ use formats::{Limits, StackInfo};
 use reconstruction::sequence::RunShare;
 use store::{CalibrationDone, NewCalibration, StagedBlob};
 
-/// What computes, on its way between the loop of a worker and its computing thread.
+/// The networks in use. They move between the loop of a worker and its computing thread.
 pub(super) struct Engines {
-    /// The networks of the program.
+    /// Networks that the program carries.
     pub(super) networks: WarmNetworks,
-    /// Those of users.
+    /// Networks of users.
     pub(super) models: ModelProcesses,
 }
 
-/// Does a task. Blocks for as long as it takes.
+/// Performs a task. Blocks until it ends.
 pub(super) fn perform(
     transport: &impl Transport,
     input: TaskInput,
@@ -58,14 +58,14 @@ pub(super) fn perform(
         }
         TaskInput::Pilot { arrays, snapshots, white, schedule, runs, mosaic } => {
             let y = arrays.snapshot(snapshots.first).map_err(PipelineError::from)?;
-            let place = pilot::place(arrays.light(monitor)?.view(), y.view(), mosaic);
+            let crop = pilot::choose_crop(arrays.light(monitor)?.view(), y.view(), mosaic);
             let first = snapshots.first as usize;
-            let task = Pilot { first, place: &place, schedule: &schedule, runs: &runs };
+            let task = Pilot { first, crop: &crop, schedule: &schedule, runs: &runs };
             engines.models.only(None, monitor)?;
             let networks = &mut engines.networks;
             let record = run_pilot(&arrays, white, (snapshots, &task), networks, monitor)?;
-            let decided = full_schedule(&schedule, record.as_ref());
-            let share = decided.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
+            let reduced = full_schedule(&schedule, record.as_ref());
+            let share = reduced.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
             monitor.reach(monitor.progress().stage, 1.0);
             (json(&record)?, Output::TileCost(share))
         }
@@ -74,19 +74,19 @@ pub(super) fn perform(
             (json(&record)?, Output::Stack(frames))
         }
         TaskInput::Assemble { job, recipe, snapshot, tiles, folder } => {
-            let shares = of_shares(&recipe, snapshot, &tiles, monitor)?;
+            let shares = verified_shares(&recipe, snapshot, &tiles, monitor)?;
             let tiles: Vec<&StoredTile> = shares.iter().flat_map(|(_, tiles)| tiles).collect();
             let cost = CostRecord::sum(tiles.iter().map(|tile| &tile.record.cost));
             let run = RunRecord::ended(Some(job.to_string()), cost, None);
             let records = tiles.iter().map(|tile| tile.record.tile.clone()).collect();
-            let told: Vec<_> = shares
+            let assessments: Vec<_> = shares
                 .iter()
                 .map(|(share, tiles)| {
-                    let told = tiles.iter().map(|tile| tile.record.assessment.clone());
-                    (share.clone(), told.collect())
+                    let assessments = tiles.iter().map(|tile| tile.record.assessment.clone());
+                    (share.clone(), assessments.collect())
                 })
                 .collect();
-            let expected = recipe.expected(snapshot as usize, &told);
+            let expected = recipe.expected(snapshot as usize, &assessments);
             let assessment = expected.as_ref().map(|expected| expected.assessment.clone());
             let error = expected.as_ref().map(|expected| expected.error.view());
             let manifest =
@@ -103,11 +103,11 @@ pub(super) fn perform(
         }
         TaskInput::Manifest { job, spec, recipe, tasks, folder } => {
             let snapshots = tasks.snapshots.iter();
-            let of_all =
+            let assessment =
                 Assessment::combined(snapshots.map(|(_, record)| record.assessment.as_ref()));
             let file = write_manifest(folder.path(), &recipe.job(job, &spec, tasks))?;
             monitor.reach(TaskStage::Writing, 1.0);
-            (json(&of_all)?, Output::Files(folder, vec![file]))
+            (json(&assessment)?, Output::Files(folder, vec![file]))
         }
         TaskInput::Check(task) => {
             let checked = check(&task, engines.models.command(), monitor)?;
@@ -117,12 +117,13 @@ pub(super) fn perform(
             let open =
                 |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
             let limits = Limits::default();
-            let (made, masks) = calibrate(&files, &limits, scratch.path(), open, &mut |share| {
-                tell(share, monitor)
-            })?;
+            let (calibrated, masks) =
+                calibrate(&files, &limits, scratch.path(), open, &mut |share| {
+                    proceed(share, monitor)
+                })?;
             let masks = masks.finish().map_err(TransportError::from)?;
-            let facts = facts(&made, masks.sha256());
-            (Value::Null, calibration(Some((facts, masks)), made.report, monitor))
+            let facts = facts(&calibrated, masks.sha256());
+            (Value::Null, calibration(Some((facts, masks)), calibrated.report, monitor))
         }
         TaskInput::Movie(task, file) => {
             movie::write(file.path(), &task, monitor)?;
@@ -130,15 +131,15 @@ pub(super) fn perform(
         }
         TaskInput::Report(masks) => {
             let masks = Reader::open(&masks, &Limits::default()).map_err(IntakeError::from)?;
-            let report = intake::report(&masks, &mut |share| tell(share, monitor))?;
+            let report = intake::report(&masks, &mut |share| proceed(share, monitor))?;
             (Value::Null, calibration(None, report, monitor))
         }
     };
     Ok(Done { progress: monitor.progress(), record, output })
 }
 
-/// Tells which share of a calibration is done; false asks to stop.
-fn tell(fraction: f64, monitor: &Monitor) -> bool {
+/// Records the finished share of a calibration. Returns false if the task should stop.
+fn proceed(fraction: f64, monitor: &Monitor) -> bool {
     monitor.reach(TaskStage::Reading, fraction);
     !monitor.stopped()
 }
@@ -152,14 +153,14 @@ fn calibration(
     Output::Calibration(Box::new(CalibrationDone { masks, report, maps }))
 }
 
-fn facts(made: &Calibrated, masks: Sha256) -> NewCalibration {
-    let report = &made.report.report;
+fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
+    let report = &calibrated.report.report;
     NewCalibration {
-        // The request has its name and colours.
+        // The store takes the name and the mosaic from the request.
         name: None,
         masks,
         format: "captures".into(),
-        sample: made.sample.to_string(),
+        sample: calibrated.sample.to_string(),
         axes: None,
         frames: report.frames,
         height: report.height,
@@ -167,12 +168,12 @@ fn facts(made: &Calibrated, masks: Sha256) -> NewCalibration {
         full_scale: 1.0,
         mask_mean: report.masks.mean,
         dead_pixels: report.masks.dead_pixels,
-        clipped_negatives: made.clipped_negatives,
+        clipped_negatives: calibrated.clipped_negatives,
         mosaic: None,
     }
 }
 
-/// What is to be remembered of a task.
+/// Converts a task's record into JSON.
 fn json(record: &impl Serialize) -> Result<Value, PipelineError> {
     serde_json::to_value(record).map_err(PipelineError::record("task"))
 }
@@ -185,12 +186,12 @@ fn run_pilot(
     monitor: &Monitor,
 ) -> Result<Option<PilotRecord>, PipelineError> {
     let SnapshotRange { first, count } = snapshots;
-    let input = arrays.window(first..first + count, task.place, white)?;
+    let input = arrays.window(first..first + count, task.crop, white)?;
     Ok(pilot::decide(input, task, networks, &mut monitor.observe(task.schedule.clone()))?)
 }
 
-/// What a snapshot takes from the runs that hold it, with the tiles of each. All tiles must be there.
-fn of_shares(
+/// Lists the runs that contribute to a snapshot, each with its tiles. Fails if a tile is missing or damaged.
+fn verified_shares(
     recipe: &Recipe,
     snapshot: u32,
     tiles: &[StoredTile],
@@ -212,14 +213,14 @@ fn tile(
     monitor: &Monitor,
 ) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
     let Engines { networks, models } = engines;
-    let before = cpu_seconds();
-    // Brings all files of the task here, the network's too.
+    let before_fetch = cpu_seconds();
+    // Fetches all files of the task, including the network's.
     let input = transport.window(task)?;
-    let spent = cpu_seconds() - before;
+    let fetch_seconds = cpu_seconds() - before_fetch;
     let file = task.model.map(|sha256| transport.model(sha256));
     let mut process = models.only(file.as_ref(), monitor)?;
-    // A process that ended just now was counted when it worked.
-    let before = cpu_seconds() - spent;
+    // Ending a child process adds its time to this one's. That time was already counted when the child worked.
+    let before = cpu_seconds() - fetch_seconds;
     let outcome = match &mut process {
         Some(process) => {
             monitor.reach(TaskStage::Deep, 0.0);
@@ -234,14 +235,14 @@ fn tile(
         }
     };
     monitor.reach(TaskStage::Writing, monitor.progress().fraction);
-    let deep = task.model.is_some() || task.schedule.needs_network();
+    let uses_network = task.model.is_some() || task.schedule.needs_network();
     let source = networks.source();
-    let (of_process, peak) = process.map_or((0.0, 0), |process| process.bill());
+    let (process_seconds, process_peak) = process.map_or((0.0, 0), |process| process.bill());
     let cost = CostRecord {
-        provider: deep.then(|| source.provider().into()),
-        onnxruntime: if deep { Some(source.version()?) } else { None },
-        cpu_seconds: cpu_seconds() - before + of_process,
-        peak_rss_bytes: peak_rss_bytes() + peak,
+        provider: uses_network.then(|| source.provider().into()),
+        onnxruntime: if uses_network { Some(source.version()?) } else { None },
+        cpu_seconds: cpu_seconds() - before + process_seconds,
+        peak_rss_bytes: peak_rss_bytes() + process_peak,
     };
     let solved = task.pieces.iter().flat_map(Clone::clone).collect();
     let assessment = match task.model {

@@ -1,9 +1,9 @@
 //! The loop of a worker process.
 //!
 //! 1. Claim a task.
-//! 2. Do it on a thread of its own.
-//! 3. Meanwhile, renew the lease, tell the progress and listen for a cancel.
-//! 4. Store what it made, or why it failed.
+//! 2. Perform it on a separate thread.
+//! 3. While it runs, renew the lease, report progress and listen for a cancellation.
+//! 4. Store the result, or the reason of a failure.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -23,31 +23,31 @@ use engine::pipeline::progress::Monitor;
 use engine::pipeline::{NetworkSource, PipelineError};
 use store::{Heartbeat, Lease};
 
-/// Time between heartbeats, and so the longest time until a cancel is heard of.
+/// Time between heartbeats, which is the longest time until the worker learns of a cancellation.
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// The longest time between looks for a task, such as one whose lease has expired.
+/// Longest time between attempts to claim a task.
 const POLL: Duration = Duration::from_millis(200);
-/// Time between two signs of life of a worker without a task.
+/// Time between two signs of life of an idle worker.
 const SIGN: Duration = Duration::from_secs(5);
-/// Pause after the database has failed.
-const TROUBLE: Duration = Duration::from_secs(2);
-/// How long a task may take to come to the end of an iteration when the worker is to end. A deep
-/// pass may take longer: it is given up then, and its task given back.
-const GRACE: Duration = Duration::from_secs(5);
-/// How long a task that hangs may take to end the processes that it started.
-const LAST_CHANCE: Duration = Duration::from_secs(1);
-/// A task may be silent for so many times its planned processor time: a machine that does much else
-/// is slow, but not for ever.
+/// Pause after a failure of the database.
+const RETRY_PAUSE: Duration = Duration::from_secs(2);
+/// Time that a task has to finish its iteration when the worker is asked to stop. A network pass may take longer.
+/// The worker then abandons it and returns the task.
+const STOP_GRACE: Duration = Duration::from_secs(5);
+/// Time that a stalled task has to end the processes that it started.
+const STALL_GRACE: Duration = Duration::from_secs(1);
+/// Factor from planned processor time to the longest time without progress, for machines that are busy with other
+/// work.
 const SLOWNESS: f64 = 4.0;
 
 #[derive(Debug, thiserror::Error)]
 pub enum WorkerError {
-    /// Not even that the worker is there can be told.
+    /// The worker could not register itself.
     #[error(transparent)]
     Transport(#[from] TransportError),
     #[error("the computing thread panicked")]
     Panicked,
-    /// A task hangs, as native code may, and nothing but the end of the process ends it.
+    /// A task hangs, probably in native code. Only the end of the process can end it.
     #[error("the task made no progress for {} seconds", .0.as_secs())]
     Stalled(Duration),
     #[error("the task was given back in the middle of an iteration")]
@@ -57,7 +57,7 @@ pub enum WorkerError {
 /// A worker: takes tasks from the queue, one at a time.
 pub struct Worker<T> {
     transport: T,
-    /// On their way between the loop and the computing thread.
+    /// `None` while the computing thread has them.
     engines: Option<Engines>,
     source: NetworkSource,
     model: ModelCommand,
@@ -66,20 +66,21 @@ pub struct Worker<T> {
     stop: CancellationToken,
 }
 
-/// What the computing thread hands back.
+/// Engines and outcome, as the computing thread returns them.
 type Computed = (Engines, Result<Done, TaskError>);
 
+/// StopReason for which a task is stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Reason {
+enum StopReason {
     Cancelled,
     Lost,
     Shutdown,
 }
 
 impl<T: Transport> Worker<T> {
-    /// A worker that ends, and gives its task back, when `stop` is called. The program's networks come from
-    /// `source`, those of users run as `model` says. A task without progress for `stall` on top of four
-    /// times its planned time is held to hang.
+    /// A worker that runs until `stop` is cancelled, and then returns its task. The program's networks come from
+    /// `source`; `model` runs those of users. A task counts as stalled after `stall` plus four times its planned
+    /// time without progress.
     pub fn new(
         transport: T,
         source: NetworkSource,
@@ -90,21 +91,21 @@ impl<T: Transport> Worker<T> {
         Self { transport, engines: None, source, model, stall, stop }
     }
 
-    /// Works until it is told to stop.
-    /// Errors: see [`WorkerError`]. A failure of a task or a passing one of the database is none.
-    /// After [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still
-    /// runs: the process must end.
+    /// Works until `stop` is cancelled.
+    /// Errors: see [`WorkerError`]. The worker survives a failed task and a temporary failure of the database.
+    /// After [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still runs, so the
+    /// process must end.
     pub async fn run(mut self) -> Result<(), WorkerError> {
         self.transport.started().await?;
         tracing::info!("waiting for tasks");
-        let mut seen = Instant::now();
+        let mut last_sign = Instant::now();
         while !self.stop.is_cancelled() {
             match self.transport.claim().await {
                 Ok(Some(claim)) => self.work(claim).await?,
                 Ok(None) => {
-                    if seen.elapsed() >= SIGN {
-                        seen = Instant::now();
-                        if let Err(error) = self.transport.seen().await {
+                    if last_sign.elapsed() >= SIGN {
+                        last_sign = Instant::now();
+                        if let Err(error) = self.transport.report_alive().await {
                             tracing::warn!(%error, "the worker's sign of life is not recorded");
                         }
                     }
@@ -115,7 +116,7 @@ impl<T: Transport> Worker<T> {
                 }
                 Err(error) => {
                     tracing::error!(%error, "no task can be claimed");
-                    self.pause(TROUBLE).await;
+                    self.pause(RETRY_PAUSE).await;
                 }
             }
         }
@@ -129,7 +130,7 @@ impl<T: Transport> Worker<T> {
         }
     }
 
-    /// Does one task and tells how it ended.
+    /// Performs one task and reports its end.
     async fn work(&mut self, claim: Claim) -> Result<(), WorkerError> {
         let Claim { lease, span, cost, input } = claim;
         let monitor = Arc::new(Monitor::default());
@@ -151,24 +152,24 @@ impl<T: Transport> Worker<T> {
         watched.instrument(span).await
     }
 
-    /// Parts with a task whose thread does not come back.
+    /// Gives up a task when its thread does not return.
     async fn abandon(&self, lease: &Lease, error: &WorkerError) {
         match error {
             WorkerError::Stalled(_) => {
-                said(self.transport.fail(lease, &error.to_string(), true).await);
+                log_failure(self.transport.fail(lease, &error.to_string(), true).await);
             }
-            WorkerError::Unfinished => said(self.transport.give_back(lease).await),
-            // Who started this process learns how it ended.
+            WorkerError::Unfinished => log_failure(self.transport.give_back(lease).await),
+            // The supervisor reports the exit status of this process.
             WorkerError::Panicked | WorkerError::Transport(_) => {}
         }
     }
 
-    /// Tells how a task ended.
+    /// Reports the end of a task.
     async fn end(
         &self,
         lease: &Lease,
         outcome: Result<Done, TaskError>,
-        reason: Option<Reason>,
+        reason: Option<StopReason>,
         monitor: &Monitor,
     ) {
         let error = match outcome {
@@ -183,22 +184,22 @@ impl<T: Transport> Worker<T> {
             ) => self.stopped(lease, reason).await,
             (TaskError::Pipeline(PipelineError::Damaged(tiles)), _) => {
                 tracing::error!(?tiles, "stored tiles are damaged and will be done again");
-                said(self.transport.redo(lease, tiles).await);
+                log_failure(self.transport.redo(lease, tiles).await);
             }
             _ => self.failed(lease, &error).await,
         }
     }
 
-    /// Tells that a task has stopped as it was asked to.
-    async fn stopped(&self, lease: &Lease, reason: Option<Reason>) {
+    /// Returns a task that was stopped, unless its lease was lost.
+    async fn stopped(&self, lease: &Lease, reason: Option<StopReason>) {
         match reason {
-            Some(Reason::Lost) => {
-                return tracing::warn!("the task is another worker's now, or nobody's");
+            Some(StopReason::Lost) => {
+                return tracing::warn!("the lease was lost; the result is dropped");
             }
-            Some(Reason::Cancelled) => tracing::info!("cancelled"),
-            Some(Reason::Shutdown) | None => tracing::info!("given back"),
+            Some(StopReason::Cancelled) => tracing::info!("cancelled"),
+            Some(StopReason::Shutdown) | None => tracing::info!("given back"),
         }
-        said(self.transport.give_back(lease).await);
+        log_failure(self.transport.give_back(lease).await);
     }
 
     fn start(
@@ -220,43 +221,43 @@ impl<T: Transport> Worker<T> {
         })
     }
 
-    /// Waits for the computing thread, with heartbeats; says why it was stopped, if it was.
+    /// Sends heartbeats until the computing thread ends. Also returns the reason if the task was stopped.
     async fn watch(
         &self,
         mut computing: JoinHandle<Computed>,
         lease: &Lease,
         monitor: &Monitor,
         patience: Duration,
-    ) -> Result<(Computed, Option<Reason>), WorkerError> {
+    ) -> Result<(Computed, Option<StopReason>), WorkerError> {
         let mut tick = tokio::time::interval(HEARTBEAT);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         // The claim was the first sign of life.
         tick.tick().await;
         let mut reason = None;
-        let too_late = async {
+        let grace_over = async {
             self.stop.cancelled().await;
-            tokio::time::sleep(GRACE).await;
+            tokio::time::sleep(STOP_GRACE).await;
         };
         let called_off = self.transport.called_off(lease);
-        tokio::pin!(too_late, called_off);
+        tokio::pin!(grace_over, called_off);
         loop {
             let silence = monitor.silence();
             if silence > patience {
-                // The task may wait for the process of a network, which must not outlive it.
+                // The task may wait for a network's process, which must not outlive the worker.
                 monitor.stop();
-                let _ = tokio::time::timeout(LAST_CHANCE, &mut computing).await;
+                let _ = tokio::time::timeout(STALL_GRACE, &mut computing).await;
                 return Err(WorkerError::Stalled(silence));
             }
             tokio::select! {
                 computed = &mut computing => {
                     return Ok((computed.map_err(|_| WorkerError::Panicked)?, reason));
                 }
-                () = self.stop.cancelled(), if reason.is_none() => reason = Some(Reason::Shutdown),
-                () = &mut too_late => return Err(WorkerError::Unfinished),
-                answer = &mut called_off, if reason.is_none() => reason = stop_for(answer),
+                () = self.stop.cancelled(), if reason.is_none() => reason = Some(StopReason::Shutdown),
+                () = &mut grace_over => return Err(WorkerError::Unfinished),
+                answer = &mut called_off, if reason.is_none() => reason = stop_reason(answer),
                 _ = tick.tick() => match self.beat(lease, monitor).await {
-                    Ok(answer) => reason = reason.or(stop_for(answer)),
-                    // If this goes on, the lease runs out, and the store will say so.
+                    Ok(answer) => reason = reason.or(stop_reason(answer)),
+                    // If this persists, the lease expires, and the store reports it lost.
                     Err(error) => tracing::error!(%error, "a heartbeat is not recorded"),
                 },
             }
@@ -266,28 +267,28 @@ impl<T: Transport> Worker<T> {
         }
     }
 
-    /// A heartbeat with all that there is to tell.
+    /// Sends a heartbeat with the progress and the new part of the solver's history.
     async fn beat(&self, lease: &Lease, monitor: &Monitor) -> Result<Heartbeat, TransportError> {
         let news = monitor.news();
         self.transport.heartbeat(lease, monitor.progress(), news.as_deref()).await
     }
 
     async fn complete(&self, lease: &Lease, done: Done, monitor: &Monitor) {
-        // What the solver did after the last heartbeat.
-        said(self.beat(lease, monitor).await.map(|_| ()));
+        // Sends the history since the last heartbeat.
+        log_failure(self.beat(lease, monitor).await.map(|_| ()));
         let completed = tokio::select! {
             completed = self.transport.complete(lease, done) => completed,
-            // Bringing a large result to its place may take longer than a lease.
+            // Storing a large result may take longer than a lease.
             never = self.keep(lease, monitor) => match never {},
         };
         match completed {
-            Ok(Heartbeat::Lost) => tracing::warn!("done, but too late: the lease had run out"),
+            Ok(Heartbeat::Lost) => tracing::warn!("done too late: the lease had expired"),
             Ok(_) => tracing::info!("done"),
             Err(error) => self.failed(lease, &TaskError::Transport(error)).await,
         }
     }
 
-    /// Renews the lease for as long as this is awaited.
+    /// Renews the lease until the future is dropped.
     async fn keep(&self, lease: &Lease, monitor: &Monitor) -> Infallible {
         loop {
             tokio::time::sleep(HEARTBEAT).await;
@@ -298,30 +299,30 @@ impl<T: Transport> Worker<T> {
     }
 
     async fn failed(&self, lease: &Lease, error: &TaskError) {
-        if error.is_disk_full() {
-            tracing::warn!(%error, "the task waits until the disk has room");
+        if error.disk_trouble().is_some() {
+            tracing::warn!(%error, "the task waits until its results can be written to the disk");
             let reason = without_paths(&error.to_string());
-            return said(self.transport.postpone(lease, &reason).await);
+            return log_failure(self.transport.postpone(lease, &reason).await);
         }
         tracing::error!(%error, "the task failed");
-        // The user reads the reason, and has no business with the folders of this machine.
+        // Users read the reason; paths of this machine do not concern them.
         let reason = without_paths(&error.to_string());
-        said(self.transport.fail(lease, &reason, error.is_retryable()).await);
+        log_failure(self.transport.fail(lease, &reason, error.is_retryable()).await);
     }
 }
 
-/// Why an answer ends a task, if it does.
-fn stop_for(answer: Heartbeat) -> Option<Reason> {
+/// Reason for which an answer stops a task, if it does.
+fn stop_reason(answer: Heartbeat) -> Option<StopReason> {
     match answer {
         Heartbeat::Continue => None,
-        Heartbeat::Cancelled => Some(Reason::Cancelled),
-        Heartbeat::Lost => Some(Reason::Lost),
+        Heartbeat::Cancelled => Some(StopReason::Cancelled),
+        Heartbeat::Lost => Some(StopReason::Lost),
     }
 }
 
-/// Logs that the end of a task could not be told; the lease runs out then.
-fn said(told: Result<(), TransportError>) {
-    if let Err(error) = told {
+/// Logs that the end of a task could not be reported. The lease then expires.
+fn log_failure(reported: Result<(), TransportError>) {
+    if let Err(error) = reported {
         tracing::error!(%error, "the end of the task is not recorded");
     }
 }

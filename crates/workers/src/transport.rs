@@ -1,5 +1,5 @@
-//! How a worker reaches the queue and the files: the store of the same machine today. A transport to
-//! other machines would offer the same, with tile tasks alone.
+//! The interface through which a worker reaches the queue and the files. `local.rs` implements it with the store of
+//! the same machine, `nats/remote.rs` for tiles on other machines.
 
 use std::error::Error;
 use std::ops::Range;
@@ -22,7 +22,7 @@ use engine::pipeline::manifest::{JobTasks, Recipe};
 use engine::pipeline::movie::MovieTask;
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::tile::TileInput;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 use reconstruction::assessment::Evidence;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
@@ -34,17 +34,17 @@ use store::{
 /// The queue or the files can't be reached.
 pub type TransportError = Box<dyn Error + Send + Sync>;
 
-/// How long a task is a worker's without a heartbeat. Long against a pause of the disk, short
-/// against a lab's patience.
+/// Time after which a task without a heartbeat is offered to another worker. It is longer than pauses of the disk
+/// and shorter than a lab would wait.
 pub(super) const LEASE: Duration = Duration::from_secs(20);
 
-/// The way to the queue and the files.
+/// Access to the queue and the files.
 #[allow(async_fn_in_trait)] // a worker does not move between threads
 pub trait Transport: Clone + Send + 'static {
     async fn started(&self) -> Result<(), TransportError>;
 
-    /// Tells that the worker, which has nothing to do, is alive.
-    async fn seen(&self) -> Result<(), TransportError>;
+    /// Reports that an idle worker is alive.
+    async fn report_alive(&self) -> Result<(), TransportError>;
 
     async fn claim(&self) -> Result<Option<Claim>, TransportError>;
 
@@ -53,7 +53,7 @@ pub trait Transport: Clone + Send + 'static {
         tokio::time::sleep(time).await;
     }
 
-    /// Renews a lease, notes the progress and how the solver went (JSON), and asks whether to go on.
+    /// Renews a lease, and records the progress and the solver's history (JSON). The answer says whether to continue.
     async fn heartbeat(
         &self,
         lease: &Lease,
@@ -61,50 +61,49 @@ pub trait Transport: Clone + Send + 'static {
         history: Option<&str>,
     ) -> Result<Heartbeat, TransportError>;
 
-    /// Waits until a task is known to be wanted no more, or to be someone else's, between heartbeats.
-    /// Where nobody tells, for ever.
+    /// Waits until a task is cancelled or its lease is lost. Never returns where only heartbeats report that.
     async fn called_off(&self, _lease: &Lease) -> Heartbeat {
         std::future::pending().await
     }
 
-    /// Hands over what was made. [`Heartbeat::Lost`] says that the task is someone else's by now; an
-    /// error that it is still the worker's.
+    /// Stores the result of a task. [`Heartbeat::Lost`] means that another worker has the task; after an error, this
+    /// worker still has it.
     async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError>;
 
-    /// Tells why a task could not be done, and whether another attempt may succeed.
+    /// Reports a failure, and whether another attempt may succeed.
     async fn fail(&self, lease: &Lease, reason: &str, retry: bool) -> Result<(), TransportError>;
 
-    /// Gives a task back for a while, as the disk is full.
+    /// Returns a task to the queue with a pause, because the disk can't be written.
     async fn postpone(&self, lease: &Lease, reason: &str) -> Result<(), TransportError> {
         self.fail(lease, reason, true).await
     }
 
-    /// Gives a task back unharmed: the worker is to end, or the job was cancelled.
+    /// Returns a task without counting a failure: the worker stops, or the job was cancelled.
     async fn give_back(&self, lease: &Lease) -> Result<(), TransportError>;
 
-    /// Has tiles done again that an assembly, which is given back, found damaged: each is given by the first
-    /// snapshot of its run, and its index.
+    /// Returns an assembly and repeats its damaged tiles. A tile is named by the first snapshot of its run and its
+    /// index.
     async fn redo(&self, lease: &Lease, tiles: &[(u32, u32)]) -> Result<(), TransportError>;
 
-    /// What a tile is made of. Brings the file of its network here, too. Blocks.
+    /// The input of a tile. Also fetches the file of its network. Blocks.
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError>;
 
-    /// The file of the network of a tile whose window was asked for, on this machine.
+    /// The local file of a network, which [`Transport::window`] has fetched.
     fn model(&self, sha256: Sha256) -> ModelFile;
 }
 
 #[derive(Debug)]
 pub struct Claim {
-    /// The right to it, to be shown with every message about it.
+    /// Names the attempt in every message about the task.
     pub lease: Lease,
     pub span: tracing::Span,
-    /// Its planned processor time in seconds.
+    /// Planned processor time in seconds.
     pub cost: f64,
-    /// What is to be done, or why that can't be told.
+    /// The work, or the reason why its input can't be read.
     pub input: Result<TaskInput, TaskError>,
 }
 
-/// What is to be done, with all that is needed.
+/// The work of a task, with its complete input.
 #[derive(Debug)]
 pub enum TaskInput {
     /// Estimate the white level of a job.
@@ -118,7 +117,7 @@ pub enum TaskInput {
         snapshot: u32,
         white: f32,
     },
-    /// Find out how many iterations of an adaptive schedule pay, and which snapshots belong together.
+    /// Decide the iterations of an adaptive schedule, and the cuts between snapshots.
     Pilot {
         arrays: Arrays,
         snapshots: SnapshotRange,
@@ -128,7 +127,7 @@ pub enum TaskInput {
         mosaic: Option<Mosaic>,
     },
     Tile(Box<TileTask>),
-    /// Blend all tiles of the runs that hold a snapshot, and write its frames to the folder.
+    /// Blend all tiles of the runs that contain a snapshot, and write its frames to the folder.
     Assemble {
         job: JobId,
         recipe: Box<Recipe>,
@@ -145,15 +144,15 @@ pub enum TaskInput {
     },
     /// Check the uploads of a request.
     Check(Box<Check>),
-    /// Make masks of captures, and a report on them; they lie in `scratch` until their scale is known.
+    /// Make masks from captures, and a report on them. `scratch` holds the masks until their scale is known.
     Captures {
         files: CaptureFiles,
         scratch: StagedPath,
         masks: Box<BlobWriter>,
     },
-    /// Make a report on masks, a prepared array at this place.
+    /// Make a report on the masks in this prepared array.
     Report(PathBuf),
-    /// Make a movie, which is written to the file.
+    /// Write a movie to the file.
     Movie(Box<MovieTask>, StagedPath),
 }
 
@@ -166,31 +165,31 @@ pub struct Check {
     pub runtime: Handle,
 }
 
-/// A tile to be reconstructed. Arrays and models are named by their hashes, so that this can go to
-/// another machine as it is.
+/// A tile to be reconstructed. Arrays and models are named by their hashes, so that the task is valid on every
+/// machine.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTask {
     pub masks: Sha256,
     pub measurement: Sha256,
-    /// The run of snapshots that it belongs to, by their indices in the measurement.
+    /// The run of snapshots that the tile belongs to, as indices in the measurement.
     pub snapshots: Range<u32>,
-    /// Those of them that are solved together, by their place in the run.
+    /// Groups of snapshots that are solved together, as indices in the run.
     pub pieces: Vec<Range<usize>>,
     pub tile: Tile,
     pub white: f32,
-    /// The schedule, after the pilot; without stages if there is a model.
+    /// The schedule after the pilot. It has no stages if there is a model.
     pub schedule: Schedule,
     pub model: Option<Sha256>,
-    /// What the pilot tells of the error of the frames.
+    /// The pilot's evidence on the error of the frames.
     #[serde(default)]
     pub evidence: Option<Evidence>,
 }
 
 #[derive(Debug)]
 pub struct Done {
-    /// Where the task stood when it ended: `fraction` is below 1 if the solver converged early.
+    /// The progress at the end: `fraction` is below 1 if the solver converged early.
     pub progress: TaskProgress,
-    /// What is to be remembered of it, for the manifest.
+    /// The record of the task, for the manifest.
     pub record: Value,
     pub output: Output,
 }
@@ -198,16 +197,16 @@ pub struct Done {
 #[derive(Debug)]
 pub enum Output {
     Record,
-    /// The share of their planned cost that the tiles still have, on \[0,1\].
+    /// Cost of the tiles after the pilot, as a share of their planned cost, on \[0,1\].
     TileCost(f64),
     /// The frames \[S B,h,w\] of a tile, or \[B,h,w\] of a preview.
     Stack(Array3<f32>),
-    /// A movie.
+    /// The file of a movie.
     File(StagedPath),
-    /// Files of a result, which are on the disk, and their folder.
+    /// Files of a result, and their folder.
     Files(StagedDir, Vec<ResultFile>),
     Checked(Box<Checked>),
-    /// The report on a calibration, and its masks if they were made of captures.
+    /// The report on a calibration, and its masks if they were made from captures.
     Calibration(Box<CalibrationDone>),
 }
 
@@ -222,17 +221,16 @@ pub enum TaskError {
 }
 
 impl TaskError {
-    /// Whether there was no room on the disk: the task is not to blame, and goes on when there is.
-    pub(super) fn is_disk_full(&self) -> bool {
+    /// The condition of the disk that caused the error, if there is one. The task is retried when the condition has ended.
+    pub(super) fn disk_trouble(&self) -> Option<DiskTrouble> {
         match self {
-            Self::Pipeline(error) => error.is_disk_full(),
-            Self::Intake(IntakeError::Format { source, .. }) => source.is_disk_full(),
-            Self::Intake(_) => false,
+            Self::Pipeline(error) => error.disk_trouble(),
+            Self::Intake(IntakeError::Format { source, .. }) => source.disk_trouble(),
+            Self::Intake(_) => None,
             Self::Transport(error) => {
-                let store =
-                    error.downcast_ref::<StoreError>().is_some_and(StoreError::is_disk_full);
+                let store = error.downcast_ref::<StoreError>().and_then(StoreError::disk_trouble);
                 let format = error.downcast_ref::<FormatError>();
-                store || format.is_some_and(FormatError::is_disk_full)
+                store.or_else(|| format.and_then(FormatError::disk_trouble))
             }
         }
     }

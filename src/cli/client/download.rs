@@ -1,4 +1,4 @@
-//! A file from the service, which goes on after a cut where it was. Nothing that is there is overwritten.
+//! Downloads a file, and resumes after an interruption. Existing files are not overwritten.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -10,25 +10,25 @@ use indicatif::ProgressBar;
 use reqwest::{Method, StatusCode};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 
-use super::{Client, Result, again, refusal};
+use super::{Client, Result, refusal, wait_to_retry};
 use crate::cli::CliError;
 use engine::job::Sha256;
 use store::LockedFile;
 
-/// Time between looks whether a file has been made.
-const MADE: Duration = Duration::from_secs(1);
+/// Time between requests for a file that the service is still making.
+const POLL: Duration = Duration::from_secs(1);
 
-/// What became of a download.
+/// Result of a download.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::cli) enum Fetched {
     New,
-    /// The same file was there.
-    Before,
+    /// An identical file existed.
+    Existing,
 }
 
 impl Client {
-    /// Fetches what is at `href` as the file `path`, and checks its hash if one is given.
-    /// Errors: if there is another file of that name.
+    /// Downloads `href` to the file `path`, and checks its hash if one is given.
+    /// Errors: another file has that name; the service can't be reached or refuses the request.
     pub(in crate::cli) async fn download(
         &self,
         href: &str,
@@ -38,27 +38,29 @@ impl Client {
     ) -> Result<Fetched> {
         let mut head = self.send(|| self.request(Method::HEAD, href)).await?;
         while head.status() == StatusCode::ACCEPTED {
-            // A movie that a worker makes, now that it is asked for.
-            tokio::time::sleep(MADE).await;
+            // A worker makes a movie at the first request for it.
+            tokio::time::sleep(POLL).await;
             head = self.send(|| self.request(Method::HEAD, href)).await?;
         }
         let field = |name| head.headers().get(name).and_then(|value| value.to_str().ok());
         let size = field("content-length").and_then(|size| size.parse::<u64>().ok());
         let etag = field("etag").map(str::to_owned);
         let (Some(size), Some(etag)) = (size, etag) else {
-            return Err(CliError::Failure(format!("{href} tells no size and ETag")).into());
+            return Err(
+                CliError::Failure(format!("the answer to {href} has no size or no ETag")).into()
+            );
         };
         bar.set_length(size);
         if path.symlink_metadata().is_ok() {
             return is_same(path, size, sha256).map_err(Into::into);
         }
-        // Whose beginning it is, the ETag in its name tells: the cut may have been in another process.
+        // Another process may have downloaded the beginning. The ETag in the name identifies the file's content.
         let part = part(path, &etag);
         self.bytes(href, &etag, (&part, size), bar).await?;
         settle(&part, path, sha256).map_err(Into::into)
     }
 
-    /// Fetches what is not in `part` yet.
+    /// Downloads the bytes that `part` lacks.
     async fn bytes(
         &self,
         href: &str,
@@ -70,36 +72,36 @@ impl Client {
         let folder = part.parent().unwrap_or(Path::new("."));
         fs::create_dir_all(folder).map_err(unwritable)?;
         let file = OpenOptions::new().create(true).append(true).open(part).map_err(unwritable)?;
-        // Two processes would write one behind the other.
+        // Two processes would append to the same file.
         let mut file =
             LockedFile::take(file).map_err(|error| CliError::file("lock", part, &error))?;
         let mut attempt = 0;
         loop {
-            let have = file.metadata().map_err(unwritable)?.len();
-            bar.set_position(have);
-            if have == size {
+            let received = file.metadata().map_err(unwritable)?.len();
+            bar.set_position(received);
+            if received == size {
                 file.sync_all().map_err(unwritable)?;
                 return Ok(());
             }
             let mut request = self.request(Method::GET, href);
-            if have > 0 {
-                let range = format!("bytes={have}-");
+            if received > 0 {
+                let range = format!("bytes={received}-");
                 request = request.header("Range", range).header("If-Range", etag);
             }
             let answer = match request.send().await {
                 Ok(answer) if answer.status().is_success() => answer,
                 Ok(answer) => {
-                    again(refusal(answer).await, &mut attempt).await?;
+                    wait_to_retry(refusal(answer).await, &mut attempt).await?;
                     continue;
                 }
                 Err(error) => {
-                    again(self.cut(&error), &mut attempt).await?;
+                    wait_to_retry(self.interruption(&error), &mut attempt).await?;
                     continue;
                 }
             };
-            let found = answer.headers().get("etag").and_then(|etag| etag.to_str().ok());
-            if found != Some(etag) {
-                let text = format!("{href} has changed while it was fetched: fetch it again");
+            let current = answer.headers().get("etag").and_then(|etag| etag.to_str().ok());
+            if current != Some(etag) {
+                let text = format!("{href} changed during the download: fetch it again");
                 return Err(CliError::Failure(text).into());
             }
             if answer.status() != StatusCode::PARTIAL_CONTENT {
@@ -115,7 +117,7 @@ impl Client {
                         attempt = 0;
                     }
                     Err(error) => {
-                        again(self.cut(&error), &mut attempt).await?;
+                        wait_to_retry(self.interruption(&error), &mut attempt).await?;
                         break;
                     }
                 }
@@ -124,25 +126,26 @@ impl Client {
     }
 }
 
-/// Where a file lies until all of it is there.
+/// Path of an incomplete file.
 fn part(path: &Path, etag: &str) -> PathBuf {
     let tag: String = etag.chars().filter(char::is_ascii_hexdigit).take(16).collect();
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     path.with_file_name(format!(".{name}.{tag}.part"))
 }
 
-/// Whether the file that is there is the one that would be fetched.
+/// Compares an existing file with the one that would be downloaded.
+/// Errors: it is a different file.
 fn is_same(path: &Path, size: u64, sha256: Option<Sha256>) -> Result<Fetched, CliError> {
     let meta = path.symlink_metadata().map_err(|error| CliError::file("read", path, &error))?;
-    let same = meta.is_file()
+    let is_same = meta.is_file()
         && meta.len() == size
-        && sha256.is_none_or(|sha256| hash(path).is_ok_and(|found| found == sha256));
-    if same { Ok(Fetched::Before) } else { Err(taken(path)) }
+        && sha256.is_none_or(|sha256| hash(path).is_ok_and(|actual| actual == sha256));
+    if is_same { Ok(Fetched::Existing) } else { Err(name_in_use(path)) }
 }
 
-fn taken(path: &Path) -> CliError {
+fn name_in_use(path: &Path) -> CliError {
     CliError::Input(format!(
-        "{} is there, and is another file: nothing is overwritten",
+        "{} exists and is a different file; it is not overwritten",
         path.display()
     ))
 }
@@ -151,33 +154,35 @@ fn hash(path: &Path) -> std::io::Result<Sha256> {
     Ok(Sha256::of_reader(&mut File::open(path)?)?.0)
 }
 
-/// Checks a file that is complete, and gives it its name.
+/// Checks a complete file, and gives it the final name.
 fn settle(part: &Path, path: &Path, sha256: Option<Sha256>) -> Result<Fetched, CliError> {
     if let Some(expected) = sha256 {
-        let found = hash(part).map_err(|error| CliError::file("read", part, &error))?;
-        if found != expected {
-            // There is nothing in it to go on from.
+        let actual = hash(part).map_err(|error| CliError::file("read", part, &error))?;
+        if actual != expected {
+            // A damaged download can't be resumed.
             let _ = fs::remove_file(part);
-            let text =
-                format!("{}: what has come has the hash {found}, not {expected}", path.display());
+            let text = format!(
+                "{}: the downloaded file has the hash {actual}, not {expected}",
+                path.display()
+            );
             return Err(CliError::Failure(text));
         }
     }
-    place(part, path)?;
+    rename_new(part, path)?;
     Ok(Fetched::New)
 }
 
-/// Gives a file its name, unless another one has it.
-pub(in crate::cli) fn place(made: &Path, path: &Path) -> Result<(), CliError> {
-    let renamed = match renameat_with(CWD, made, CWD, path, RenameFlags::NOREPLACE) {
+/// Renames a file unless the new name is in use.
+pub(in crate::cli) fn rename_new(from: &Path, path: &Path) -> Result<(), CliError> {
+    let renamed = match renameat_with(CWD, from, CWD, path, RenameFlags::NOREPLACE) {
         // Some network file systems can't do that in one step.
         Err(rustix::io::Errno::INVAL | rustix::io::Errno::NOSYS) if !path.exists() => {
-            fs::rename(made, path)
+            fs::rename(from, path)
         }
         renamed => renamed.map_err(Into::into),
     };
     renamed.map_err(|error| match error.kind() {
-        ErrorKind::AlreadyExists => taken(path),
+        ErrorKind::AlreadyExists => name_in_use(path),
         _ => CliError::file("write", path, &error),
     })
 }

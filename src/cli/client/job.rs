@@ -1,4 +1,4 @@
-//! A job as the service shows it, and its files.
+//! Jobs as the service shows them, and their files.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -24,7 +24,7 @@ pub(in crate::cli) struct Job {
     pub(in crate::cli) finished_at: Option<Timestamp>,
     /// Findings of the checks.
     pub(in crate::cli) warnings: Vec<Finding>,
-    /// None until the job has succeeded, and where the quality can't be predicted.
+    /// `None` until the job has succeeded, and if the quality can't be predicted.
     pub(in crate::cli) assessment: Option<Assessment>,
     pub(in crate::cli) snapshots: SnapshotRange,
     pub(in crate::cli) progress: Progress,
@@ -44,7 +44,7 @@ pub(in crate::cli) enum Wanted {
     /// The frames of each snapshot as a multi-part EXR.
     #[value(name = "stack.exr")]
     Stack,
-    /// The same with the expected error in a layer `sigma`.
+    /// The multi-part EXR with the expected error in an additional layer `sigma`.
     #[value(name = "stack-sigma.exr")]
     StackWithError,
     /// The frames of each snapshot as a BigTIFF for Fiji and napari.
@@ -90,8 +90,8 @@ struct Listed {
 }
 
 impl Wanted {
-    /// Whether a file of a snapshot is meant.
-    fn has(self, name: &str) -> bool {
+    /// True if this selects the file `name` of a snapshot.
+    fn includes(self, name: &str) -> bool {
         match self {
             Self::Array => name == "frames.npy",
             Self::Stack => name == "stack.exr",
@@ -110,8 +110,8 @@ impl Wanted {
         }
     }
 
-    /// The file of the whole job that is meant: its address below that of the job, and its name.
-    fn of_job(self) -> Option<(&'static str, &'static str)> {
+    /// For a file of the whole job, its path below the job's URL and its local name.
+    fn job_file(self) -> Option<(&'static str, &'static str)> {
         match self {
             Self::Manifest => Some(("manifest.json", "manifest.json")),
             Self::SequenceArray => Some(("sequence/frames.npy", "sequence.npy")),
@@ -124,15 +124,15 @@ impl Wanted {
 }
 
 fn parsed<T: for<'de> Deserialize<'de>>(value: Value) -> Result<T> {
-    let unknown =
-        |error| CliError::Failure(format!("the service's answer is not understood: {error}"));
-    Ok(serde_json::from_value(value).map_err(unknown)?)
+    let unreadable =
+        |error| CliError::Failure(format!("the service's answer can't be read: {error}"));
+    Ok(serde_json::from_value(value).map_err(unreadable)?)
 }
 
-/// The identifier in what the service says of a thing.
+/// The identifier in an answer of the service.
 pub(super) fn id(value: &Value) -> Result<String> {
     let id = value["id"].as_str().map(str::to_owned);
-    Ok(id.ok_or_else(|| CliError::Failure("the service names no identifier".into()))?)
+    Ok(id.ok_or_else(|| CliError::Failure("the service's answer has no identifier".into()))?)
 }
 
 impl Job {
@@ -140,7 +140,7 @@ impl Job {
         parsed(value)
     }
 
-    /// How it has ended, unless it has succeeded or goes on.
+    /// Describes the end of a job that failed or was cancelled.
     pub(in crate::cli) fn failure(&self) -> Option<String> {
         if !self.state.is_final() || self.state == JobState::Succeeded {
             return None;
@@ -151,28 +151,33 @@ impl Job {
 }
 
 impl Client {
-    /// A job; answered when it has ended, or after so many seconds.
+    /// Requests a job. The service answers when the job has ended, at the latest after `wait` seconds.
     pub(in crate::cli) async fn job(&self, id: &str, wait: u32) -> Result<Job> {
         Job::new(self.get(&format!("/v1/jobs/{id}?wait={wait}")).await?)
     }
 
-    /// Makes a thing with a key, and waits until its files are checked; gives its identifier.
-    pub(in crate::cli) async fn made(&self, path: &str, body: &Value, key: &str) -> Result<String> {
-        let mut made = self.create(path, body, key).await?;
-        let id = id(&made)?;
-        while made["state"] == "preparing" {
-            made = self.get(&format!("{path}/{id}?wait=20")).await?;
+    /// Creates a resource with an idempotency key, and waits until its files are checked. Returns its identifier.
+    pub(in crate::cli) async fn create_checked(
+        &self,
+        path: &str,
+        body: &Value,
+        key: &str,
+    ) -> Result<String> {
+        let mut resource = self.create(path, body, key).await?;
+        let id = id(&resource)?;
+        while resource["state"] == "preparing" {
+            resource = self.get(&format!("{path}/{id}?wait=20")).await?;
         }
-        let problem = &made["problem"];
+        let problem = &resource["problem"];
         match problem["status"].as_u64().and_then(|status| u16::try_from(status).ok()) {
-            // Another attempt makes another one.
+            // A retry with the same key creates a new resource.
             Some(status) => Err(refused(StatusCode::from_u16(status).unwrap_or_default(), problem)),
             None => Ok(id),
         }
     }
 
-    /// Fetches files of a job into a folder: those of each snapshot into `snapshot_0000` and so on. Gives all
-    /// that are there now.
+    /// Downloads files of a job into a folder, those of each snapshot into `snapshot_0000` and so on. Returns the
+    /// paths of all files.
     pub(in crate::cli) async fn fetch(
         &self,
         job: &Job,
@@ -182,29 +187,33 @@ impl Client {
         let base = format!("/v1/jobs/{}", job.id);
         let mut files = Vec::new();
         for snapshot in job.snapshots.indices() {
-            let of_snapshot = format!("{base}/snapshots/{snapshot}");
-            let inside = folder.join(format!("snapshot_{snapshot:04}"));
-            let listed: Vec<Listed> = parsed(self.get(&of_snapshot).await?["files"].take())?;
+            let snapshot_url = format!("{base}/snapshots/{snapshot}");
+            let snapshot_folder = folder.join(format!("snapshot_{snapshot:04}"));
+            let listed: Vec<Listed> = parsed(self.get(&snapshot_url).await?["files"].take())?;
             for file in listed {
                 let Some(href) = &file.href else { continue };
-                if wanted.iter().any(|wanted| wanted.has(&file.name)) {
-                    let path = inside.join(relative(&file.name)?);
+                if wanted.iter().any(|wanted| wanted.includes(&file.name)) {
+                    let path = snapshot_folder.join(relative(&file.name)?);
                     files.push((href.clone(), path, Some(file.sha256)));
                 }
             }
-            let made = [
+            let exports = [
                 (Wanted::StackWithError, "stack.exr?layers=sigma", "stack-sigma.exr"),
                 (Wanted::Tiff, "stack.tif", "stack.tif"),
                 (Wanted::Movie, "movie.mp4", "movie.mp4"),
             ];
-            for (made, place, name) in made {
-                if wanted.contains(&made) {
-                    files.push((format!("{of_snapshot}/{place}"), inside.join(name), None));
+            for (export, query, name) in exports {
+                if wanted.contains(&export) {
+                    files.push((
+                        format!("{snapshot_url}/{query}"),
+                        snapshot_folder.join(name),
+                        None,
+                    ));
                 }
             }
         }
-        for (place, name) in wanted.iter().filter_map(|wanted| wanted.of_job()) {
-            files.push((format!("{base}/{place}"), folder.join(name), None));
+        for (query, name) in wanted.iter().filter_map(|wanted| wanted.job_file()) {
+            files.push((format!("{base}/{query}"), folder.join(name), None));
         }
         for (href, path, sha256) in &files {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -215,8 +224,8 @@ impl Client {
         Ok(files.into_iter().map(|(_, path, _)| path).collect())
     }
 
-    /// Sends a file, with a bar on a terminal.
-    pub(in crate::cli) async fn sent(&self, path: &Path) -> Result<Sha256> {
+    /// Uploads a file, with a progress bar on a terminal.
+    pub(in crate::cli) async fn upload_with_bar(&self, path: &Path) -> Result<Sha256> {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let bar: ProgressBar = progress::bytes(name);
         let sha256 = self.upload(path, &bar).await;
@@ -225,11 +234,11 @@ impl Client {
     }
 }
 
-/// A name that leads out of no folder.
+/// Checks that a file name does not lead out of its folder.
 fn relative(name: &str) -> Result<&Path> {
     let path = Path::new(name);
     if path.components().all(|part| matches!(part, Component::Normal(_))) {
         return Ok(path);
     }
-    Err(CliError::Failure(format!("the service names a file {name:?}")).into())
+    Err(CliError::Failure(format!("the service lists a file with the unsafe name {name:?}")).into())
 }

@@ -1,4 +1,4 @@
-//! What a lab machine says to the service, over connections that break.
+//! A client of the service for lab machines, which retries over unreliable connections.
 
 mod download;
 mod job;
@@ -16,19 +16,19 @@ use serde_json::Value;
 
 use super::CliError;
 
-pub(super) use download::place;
+pub(super) use download::rename_new;
 pub(super) use job::{Job, Wanted};
 
-/// About five minutes until the last try.
-const TRIES: u32 = 16;
-/// The longest pause between two tries, in seconds.
-const LONGEST: f64 = 30.0;
+/// Attempts at a request. With the pauses, they take about five minutes.
+const MAX_ATTEMPTS: u32 = 16;
+/// Longest pause between two attempts, in seconds.
+const MAX_PAUSE: f64 = 30.0;
 
-/// Which service.
+/// Address and token of a service.
 #[derive(Debug, Args)]
 pub struct ServiceArguments {
-    /// Address of the service. For https, the certificate must be signed by an authority that this system trusts;
-    /// the variable SSL_CERT_FILE names a PEM file with another one.
+    /// Address of the service. For https, the certificate must be signed by an authority that this system trusts.
+    /// The variable SSL_CERT_FILE names a PEM file with another authority.
     #[arg(
         long,
         env = "SCI_RECON_URL",
@@ -36,27 +36,27 @@ pub struct ServiceArguments {
         default_value = "http://127.0.0.1:8080"
     )]
     url: String,
-    /// The token of the lab; better in the environment or the configuration file than on the command line, which
-    /// others on this machine can see.
+    /// The token of the lab. Set it in the environment or the configuration file: other users of this machine can see
+    /// the command line.
     #[arg(long, env = "SCI_RECON_TOKEN", value_name = "TOKEN", hide_env_values = true)]
     token: Option<String>,
 }
 
-/// Why the service did not do what it was asked for.
+/// Failure of a request.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ClientError {
-    /// It can't be reached, or can't serve this now, for minutes.
+    /// The service was unreachable or unavailable for minutes. A later attempt may succeed.
     #[error("{0}")]
-    Passing(String),
-    /// There is no service that can be spoken to under this address, and waiting will not change it.
+    Temporary(String),
+    /// No service can be reached at this address, and waiting will not change that.
     #[error("{0}")]
     Unreachable(String),
-    /// It refuses this request, and will again.
-    #[error("the service refuses it ({status} {code}): {detail}")]
+    /// The service refuses the request permanently.
+    #[error("the service refuses the request ({status} {code}): {detail}")]
     Refused { status: StatusCode, code: String, detail: String },
-    /// Something is wrong here.
+    /// An error on this machine.
     #[error("{0}")]
-    Here(#[from] CliError),
+    Local(#[from] CliError),
 }
 
 pub(super) type Result<T, E = ClientError> = std::result::Result<T, E>;
@@ -64,7 +64,7 @@ pub(super) type Result<T, E = ClientError> = std::result::Result<T, E>;
 impl From<ClientError> for CliError {
     fn from(error: ClientError) -> Self {
         match error {
-            ClientError::Here(error) => error,
+            ClientError::Local(error) => error,
             ClientError::Refused { status, .. } if status.is_client_error() => {
                 Self::Input(error.to_string())
             }
@@ -74,13 +74,13 @@ impl From<ClientError> for CliError {
     }
 }
 
-/// A service.
+/// A connection to a service.
 #[derive(Debug, Clone)]
 pub(super) struct Client {
     url: String,
     token: Option<String>,
     http: reqwest::Client,
-    /// True once the service has answered: its address and certificate were right then.
+    /// True once the service has answered, so that address and certificate are known to be right.
     has_answered: Arc<AtomicBool>,
 }
 
@@ -90,10 +90,10 @@ impl Client {
         Self::at(&arguments.url, token)
     }
 
-    /// The service at an address, for those who have this token.
+    /// A client of the service at `url`.
     pub(super) fn at(url: &str, token: Option<String>) -> Result<Self, CliError> {
         let wrong = |error: &dyn std::fmt::Display| {
-            CliError::Input(format!("{url:?} is no address of a service: {error}"))
+            CliError::Input(format!("{url:?} is not an address of a service: {error}"))
         };
         let parsed = reqwest::Url::parse(url).map_err(|error| wrong(&error))?;
         if !["http", "https"].contains(&parsed.scheme()) {
@@ -105,7 +105,7 @@ impl Client {
             // The check of a large file takes minutes.
             .read_timeout(Duration::from_secs(300))
             .build()
-            .map_err(|error| CliError::Failure(told(&error)))?;
+            .map_err(|error| CliError::Failure(with_causes(&error)))?;
         let url = url.trim_end_matches('/').to_owned();
         Ok(Self { url, token, http, has_answered: Arc::default() })
     }
@@ -118,7 +118,7 @@ impl Client {
         }
     }
 
-    /// Sends a request, again after a cut or a passing refusal; it must do no harm when it arrives twice.
+    /// Sends a request, and repeats it after an interruption or a temporary refusal. The request must be idempotent.
     async fn send(&self, request: impl Fn() -> RequestBuilder) -> Result<Response> {
         let mut attempt = 0;
         loop {
@@ -127,29 +127,29 @@ impl Client {
             let error = match sent {
                 Ok(response) if response.status().is_success() => return Ok(response),
                 Ok(response) => refusal(response).await,
-                Err(error) => self.cut(&error),
+                Err(error) => self.interruption(&error),
             };
-            again(error, &mut attempt).await?;
+            wait_to_retry(error, &mut attempt).await?;
         }
     }
 
-    fn cut(&self, error: &reqwest::Error) -> ClientError {
-        let text = format!("{} can't be reached: {}", self.url, told(error));
-        // A service that has answered under this address is expected back.
-        let lasting = !self.has_answered.load(Ordering::Relaxed);
-        match unreachable::remedy(error).filter(|_| lasting) {
+    fn interruption(&self, error: &reqwest::Error) -> ClientError {
+        let text = format!("{} can't be reached: {}", self.url, with_causes(error));
+        // A service that has answered at this address is expected to return.
+        let may_be_permanent = !self.has_answered.load(Ordering::Relaxed);
+        match unreachable::remedy(error).filter(|_| may_be_permanent) {
             Some(remedy) => ClientError::Unreachable(format!("{text}: {remedy}")),
-            None => ClientError::Passing(text),
+            None => ClientError::Temporary(text),
         }
     }
 
-    /// Reads a JSON document, again where it was cut.
+    /// Sends a request and reads the JSON answer. Repeats both if the answer is interrupted.
     async fn json(&self, request: impl Fn() -> RequestBuilder) -> Result<Value> {
         let mut attempt = 0;
         loop {
             match self.send(&request).await?.json().await {
                 Ok(value) => return Ok(value),
-                Err(error) => again(self.cut(&error), &mut attempt).await?,
+                Err(error) => wait_to_retry(self.interruption(&error), &mut attempt).await?,
             }
         }
     }
@@ -162,33 +162,33 @@ impl Client {
         self.json(|| self.request(reqwest::Method::POST, path).json(body)).await
     }
 
-    /// Makes a thing once, however often it is asked for with the same key.
+    /// Creates a resource. Repeated requests with the same key create it once.
     pub(super) async fn create(&self, path: &str, body: &Value, key: &str) -> Result<Value> {
-        let make = || self.request(reqwest::Method::POST, path).json(body);
-        self.json(|| make().header("Idempotency-Key", key)).await
+        let request = || self.request(reqwest::Method::POST, path).json(body);
+        self.json(|| request().header("Idempotency-Key", key)).await
     }
 }
 
-/// Waits before the next try, and says so before the first pause; gives the error back where that would not help,
-/// or has not.
-async fn again(error: ClientError, attempt: &mut u32) -> Result<()> {
+/// Waits before the next attempt, and prints a message before the first pause. Returns the error if it is permanent,
+/// or after the last attempt.
+async fn wait_to_retry(error: ClientError, attempt: &mut u32) -> Result<()> {
     *attempt += 1;
     match error {
-        ClientError::Passing(reason) if *attempt < TRIES => {
+        ClientError::Temporary(reason) if *attempt < MAX_ATTEMPTS => {
             if *attempt == 1 {
                 eprintln!("sci-recon: {reason}; trying again for about five minutes");
             }
         }
         error => return Err(error),
     }
-    let seconds = (0.1 * f64::from(1 << (*attempt).min(10))).min(LONGEST);
-    // Not all clients at once.
+    let seconds = (0.1 * f64::from(1 << (*attempt).min(10))).min(MAX_PAUSE);
+    // Random pauses spread the attempts of many clients.
     let share = rand::rng().random_range(0.5..1.0);
     tokio::time::sleep(Duration::from_secs_f64(seconds * share)).await;
     Ok(())
 }
 
-/// What an answer says that is no success.
+/// Reads the problem in an answer without success.
 async fn refusal(response: Response) -> ClientError {
     let status = response.status();
     refused(status, &response.json().await.unwrap_or_default())
@@ -196,24 +196,24 @@ async fn refusal(response: Response) -> ClientError {
 
 fn refused(status: StatusCode, problem: &Value) -> ClientError {
     let detail = problem["detail"].as_str().unwrap_or("no reason is given");
-    let places = problem["errors"].as_array().into_iter().flatten();
-    let places = places.map(|error| error["pointer"].as_str().unwrap_or_default());
-    let places = places.filter(|place| !place.is_empty()).collect::<Vec<_>>().join(", ");
-    let place = if places.is_empty() { places } else { format!("{places}: ") };
-    let detail = format!("{place}{detail}");
+    let errors = problem["errors"].as_array().into_iter().flatten();
+    let pointers = errors.map(|error| error["pointer"].as_str().unwrap_or_default());
+    let pointers = pointers.filter(|pointer| !pointer.is_empty()).collect::<Vec<_>>().join(", ");
+    let prefix = if pointers.is_empty() { pointers } else { format!("{pointers}: ") };
+    let detail = format!("{prefix}{detail}");
     let code = problem["code"].as_str().unwrap_or_default().to_owned();
-    // Of a service that starts, stops or is full, or of a proxy before it.
-    let passing = [408, 423, 429, 502, 503, 504, 507].contains(&status.as_u16());
-    // Masks that are not made yet; a fault of the service.
-    let soon = [409, 500].contains(&status.as_u16()) && problem["retryable"] == true;
-    if soon || (passing && problem["retryable"] != false) {
-        return ClientError::Passing(format!("the service answers {status} {code}: {detail}"));
+    // A service that starts, stops or is full, or its proxy, answers with these.
+    let is_unavailable = [408, 423, 429, 502, 503, 504, 507].contains(&status.as_u16());
+    // Masks that are not finished yet, or an internal error of the service.
+    let is_retryable = [409, 500].contains(&status.as_u16()) && problem["retryable"] == true;
+    if is_retryable || (is_unavailable && problem["retryable"] != false) {
+        return ClientError::Temporary(format!("the service answers {status} {code}: {detail}"));
     }
     ClientError::Refused { status, code, detail }
 }
 
-/// An error with what it came of.
-fn told(error: &dyn std::error::Error) -> String {
+/// The text of an error and its causes.
+fn with_causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
     while let Some(cause) = source {

@@ -1,12 +1,12 @@
-//! Failures to reach a service that no further try mends.
+//! Failures to reach a service that persist until the user acts.
 
 use std::error::Error;
 use std::io;
 
 use rustls::Error as TlsError;
 
-/// The remedy for a failed connection that no further try mends: an untrusted certificate, a port without TLS, an
-/// unknown host. None for all other failures.
+/// The remedy for a failure that retries can't solve: an untrusted certificate, a port without TLS, or an unknown
+/// host. Returns `None` for all other failures.
 pub(super) fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
     if let Some(error) = error.downcast_ref::<TlsError>() {
         return tls_remedy(error);
@@ -25,21 +25,21 @@ pub(super) fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
 fn tls_remedy(error: &TlsError) -> Option<&'static str> {
     match error {
         TlsError::InvalidCertificate(_) => Some(
-            "the certificate of the service is not trusted; name the certificate of its authority (PEM) in \
+            "the certificate of the service is not trusted; give the certificate of its authority (PEM) in \
              SSL_CERT_FILE, or correct the certificate",
         ),
         TlsError::InvalidMessage(_) => {
-            Some("nothing there speaks TLS; is it http:// instead of https://?")
+            Some("the server there does not use TLS; try http:// instead of https://")
         }
-        TlsError::PeerIncompatible(_) => Some("the service speaks no version of TLS from 1.2 on"),
+        TlsError::PeerIncompatible(_) => Some("the service supports neither TLS 1.2 nor TLS 1.3"),
         _ => None,
     }
 }
 
-/// The standard library gives the resolver's answer as text only.
+/// The remedy for an unknown host. The standard library reports the resolver's answer only as text.
 fn lookup_remedy(error: &io::Error) -> Option<&'static str> {
     let text = error.to_string();
-    let unknown =
+    let is_unknown =
         text.starts_with("failed to lookup address") && !text.contains("Temporary failure");
-    unknown.then_some("correct the host name in the address")
+    is_unknown.then_some("correct the host name in the address")
 }

@@ -1,4 +1,4 @@
-//! A file to the service in pieces (tus 1.0), which goes on after a cut where it was, also in another process.
+//! Uploads a file in pieces (tus 1.0). An interrupted upload is resumed, even by another process.
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -10,17 +10,17 @@ use indicatif::ProgressBar;
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use uuid::Uuid;
 
-use super::{Client, ClientError, Result, again, refusal};
+use super::{Client, ClientError, Result, refusal, wait_to_retry};
 use crate::cli::CliError;
 use engine::job::Sha256;
 
 /// Bytes of a piece.
 const PIECE: u64 = 4 << 20;
-/// Uploads of one file that are begun anew because what had come is gone.
-const BEGINNINGS: u32 = 3;
+/// Attempts at one file. A new attempt is needed if the service has lost the received bytes.
+const MAX_UPLOADS: u32 = 3;
 
 impl Client {
-    /// Sends a file, unless it is there already; gives its hash. Memory holds a piece.
+    /// Uploads a file unless the service already has it, and returns its hash. Memory holds one piece.
     pub(in crate::cli) async fn upload(&self, path: &Path, bar: &ProgressBar) -> Result<Sha256> {
         let unreadable = |error: std::io::Error| CliError::file("read", path, &error);
         let mut file = File::open(path).map_err(unreadable)?;
@@ -29,26 +29,27 @@ impl Client {
             return Err(CliError::Input(format!("{} is empty", path.display())).into());
         }
         bar.set_length(size);
-        // The same file is the same upload, whoever sends it: it goes on where another process was.
+        // The key is derived from the content, so that a later process resumes the same upload.
         let mut key = format!("upload-{sha256}");
-        for _ in 0..BEGINNINGS {
+        for _ in 0..MAX_UPLOADS {
             if self.has(sha256).await? {
                 bar.set_position(size);
                 return Ok(sha256);
             }
-            let place = self.begin(sha256, size, &key).await?;
-            match self.pieces(&place, &mut file, size, bar).await {
+            let url = self.begin(sha256, size, &key).await?;
+            match self.pieces(&url, &mut file, size, bar).await {
                 Err(ClientError::Refused { status, .. })
                     if [StatusCode::NOT_FOUND, StatusCode::GONE].contains(&status) => {}
                 sent => sent?,
             }
-            // What that key stands for may be gone: an upload that has ended, or a file that was deleted since.
+            // The upload with that key may have expired, or its file may have been deleted.
             key = format!("upload-{sha256}-{}", Uuid::now_v7());
         }
         if self.has(sha256).await? {
             return Ok(sha256);
         }
-        let text = format!("{}: the service loses the upload again and again", path.display());
+        let text =
+            format!("{}: the service has lost the upload {MAX_UPLOADS} times", path.display());
         Err(CliError::Failure(text).into())
     }
 
@@ -64,74 +65,71 @@ impl Client {
         self.request(method, path).header("Tus-Resumable", "1.0.0")
     }
 
-    /// Announces a file; gives the address of its pieces.
+    /// Creates an upload, and returns the path of its URL.
     async fn begin(&self, sha256: Sha256, size: u64, key: &str) -> Result<String> {
         let metadata = format!("sha256 {}", STANDARD.encode(sha256.to_string()));
-        let begun = self.send(|| {
+        let created = self.send(|| {
             let request = self.tus(Method::POST, "/v1/uploads").header("Idempotency-Key", key);
             request.header("Upload-Length", size).header("Upload-Metadata", &metadata)
         });
-        let begun = begun.await?;
-        let place = begun.headers().get("location").and_then(|place| place.to_str().ok());
-        // Behind a proxy the service's own path is at the end.
-        let path = place.and_then(|place| place.find("/v1/uploads/").map(|at| &place[at..]));
-        let path = path.ok_or_else(|| CliError::Failure("the service names no upload".into()))?;
+        let created = created.await?;
+        let url = created.headers().get("location").and_then(|url| url.to_str().ok());
+        // A proxy may put a prefix before the service's path.
+        let path = url.and_then(|url| url.find("/v1/uploads/").map(|at| &url[at..]));
+        let path =
+            path.ok_or_else(|| CliError::Failure("the service's answer names no upload".into()))?;
         Ok(path.to_owned())
     }
 
-    /// Sends what the service does not have yet.
-    async fn pieces(
-        &self,
-        place: &str,
-        file: &mut File,
-        size: u64,
-        bar: &ProgressBar,
-    ) -> Result<()> {
+    /// Sends the bytes that the service lacks.
+    async fn pieces(&self, url: &str, file: &mut File, size: u64, bar: &ProgressBar) -> Result<()> {
         let unreadable = |error| CliError::Failure(format!("the file can't be read: {error}"));
         let mut attempt = 0;
-        let mut offset = self.offset(place).await?;
+        let mut offset = self.offset(url).await?;
         while offset < size {
             bar.set_position(offset);
             let mut piece = Vec::new();
             file.seek(SeekFrom::Start(offset)).map_err(unreadable)?;
             file.take(PIECE).read_to_end(&mut piece).map_err(unreadable)?;
             if piece.is_empty() {
-                return Err(CliError::Failure("the file became shorter".into()).into());
+                return Err(
+                    CliError::Failure("the file became shorter during the upload".into()).into()
+                );
             }
             let request = self
-                .tus(Method::PATCH, place)
+                .tus(Method::PATCH, url)
                 .header("Upload-Offset", offset)
                 .header("Content-Type", "application/offset+octet-stream")
                 .body(piece);
             let error = match request.send().await {
                 Ok(answer) if answer.status().is_success() => {
-                    (offset, attempt) = (told_offset(&answer)?, 0);
+                    (offset, attempt) = (parse_offset(&answer)?, 0);
                     continue;
                 }
-                // An answer was lost, not its piece.
-                Ok(answer) if answer.status() == StatusCode::CONFLICT => {
-                    ClientError::Passing("the piece does not follow".into())
-                }
+                // The service has the piece; its answer was lost.
+                Ok(answer) if answer.status() == StatusCode::CONFLICT => ClientError::Temporary(
+                    "the offset does not match the bytes received so far".into(),
+                ),
                 Ok(answer) => refusal(answer).await,
-                Err(error) => self.cut(&error),
+                Err(error) => self.interruption(&error),
             };
-            again(error, &mut attempt).await?;
+            wait_to_retry(error, &mut attempt).await?;
             let before = offset;
-            offset = self.offset(place).await?;
-            // A piece that was cut counts as far as it came.
+            offset = self.offset(url).await?;
+            // The received part of an interrupted piece counts.
             attempt = if offset > before { 0 } else { attempt };
         }
         bar.set_position(size);
         Ok(())
     }
 
-    async fn offset(&self, place: &str) -> Result<u64> {
-        told_offset(&self.send(|| self.tus(Method::HEAD, place)).await?)
+    async fn offset(&self, url: &str) -> Result<u64> {
+        parse_offset(&self.send(|| self.tus(Method::HEAD, url)).await?)
     }
 }
 
-fn told_offset(answer: &Response) -> Result<u64> {
+fn parse_offset(answer: &Response) -> Result<u64> {
     let offset = answer.headers().get("upload-offset").and_then(|offset| offset.to_str().ok());
     let offset = offset.and_then(|offset| offset.parse().ok());
-    offset.ok_or_else(|| CliError::Failure("the service tells no offset".into()).into())
+    offset.ok_or_else(|| CliError::Failure("the service's answer has no offset".into()).into())
 }

@@ -1,4 +1,4 @@
-//! `sci-recon demo`: a real clip through the real service.
+//! `sci-recon demo`: sends a simulated snapshot of a real clip through the service.
 
 mod page;
 mod report;
@@ -21,16 +21,16 @@ use crate::cli::output::print_line;
 use engine::intake::sample;
 use engine::job::{Algorithm, JobState};
 use formats::{Limits, exr};
-use page::Made;
+use page::Reconstruction;
 use report::{PAGE, Quality, Report};
 use service::Service;
 
-/// The file that tells a demo's folder from others.
+/// The file that identifies the folder of a demo.
 const REPORT: &str = "demo.json";
-/// What the demo makes in its folder.
+/// Names of the files and folders that the demo creates.
 const PARTS: [&str; 6] = ["input", "service", "frames", "service.log", page::PICTURES, PAGE];
 const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastdvdnet];
-/// Time between looks at the jobs.
+/// Time between requests for the jobs' progress.
 const POLL: Duration = Duration::from_millis(250);
 
 /// Run the service on a simulated snapshot, and compare the results.
@@ -52,20 +52,20 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
 async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
     let started = Instant::now();
-    let say = |text: String| if arguments.json { Ok(()) } else { print_line(text) };
-    // 1. A lab's files: masks and one snapshot.
+    let print = |text: String| if arguments.json { Ok(()) } else { print_line(text) };
+    // 1. Write the files that a lab would have: masks and one snapshot.
     let truth = sample(&out.join("input"))?.frames;
     let (frames, height, width) = truth.dim();
-    say(format!("made masks and a snapshot of {frames} frames of {height}x{width}"))?;
-    // 2. The service.
+    print(format!("made masks and a snapshot of {frames} frames of {height}x{width}"))?;
+    // 2. Start the service.
     let service = Service::start(out).await?;
-    say(format!("the service is at {}", service.url()))?;
-    // 3. Over HTTP from here on, as a lab machine would.
+    print(format!("the service is at {}", service.url()))?;
+    // 3. Use it over HTTP, like a lab machine.
     let client = Client::at(service.url(), None)?;
     let results = through_http(&client, out, &truth).await;
     service.stop().await?;
-    let ([gap_tv, pnp_tv_fastdvdnet], made) = results?;
-    // 4. The comparison.
+    let ([gap_tv, pnp_tv_fastdvdnet], reconstructions) = results?;
+    // 4. Compare the results.
     let report = Report {
         gap_tv,
         pnp_tv_fastdvdnet,
@@ -75,26 +75,26 @@ async fn demo(arguments: &Arguments, out: &Path) -> Result<()> {
     };
     fs::write(out.join(REPORT), report.to_json()?)
         .map_err(|error| CliError::file("write", &out.join(REPORT), &error))?;
-    page::write(out, &truth, &made, &report)?;
+    page::write(out, &truth, &reconstructions, &report)?;
     report.print(arguments.json)
 }
 
-/// Sends the files, asks for both algorithms, waits, and compares the frames that come back.
+/// Uploads the files, requests both algorithms, waits, and compares the frames with the truth.
 async fn through_http(
     client: &Client,
     out: &Path,
     truth: &Array3<f32>,
-) -> Result<([Quality; 2], Vec<Made>)> {
+) -> Result<([Quality; 2], Vec<Reconstruction>)> {
     let input = out.join("input");
-    let masks = client.sent(&input.join("masks.npy")).await?;
-    let measurement = client.sent(&input.join("measurement.npy")).await?;
-    let calibration = made(client, "/v1/calibrations", &json!({"masks": masks})).await?;
+    let masks = client.upload_with_bar(&input.join("masks.npy")).await?;
+    let measurement = client.upload_with_bar(&input.join("measurement.npy")).await?;
+    let calibration = create(client, "/v1/calibrations", &json!({"masks": masks})).await?;
     let body = json!({"calibration": calibration, "data": measurement});
-    let measurement = made(client, "/v1/measurements", &body).await?;
+    let measurement = create(client, "/v1/measurements", &body).await?;
     let mut jobs = Vec::new();
     for name in COMPARED.map(|algorithm| algorithm.into_str()) {
         let body = json!({"measurement": measurement, "algorithm": name, "label": "demo"});
-        jobs.push((name, made(client, "/v1/jobs", &body).await?));
+        jobs.push((name, create(client, "/v1/jobs", &body).await?));
     }
     watch(client, &jobs).await?;
     let (mut qualities, mut results) = (Vec::new(), Vec::new());
@@ -103,17 +103,17 @@ async fn through_http(
         let (frames, movie) = results_of(client, job, &folder).await?;
         qualities.push(report::compare(&frames, truth, cpu_seconds(client, job).await?)?);
         let movie = movie.strip_prefix(out).unwrap_or(&movie).display().to_string();
-        results.push(Made { name, frames, movie });
+        results.push(Reconstruction { name, frames, movie });
     }
     Ok(([qualities[0], qualities[1]], results))
 }
 
-/// Makes a calibration, a measurement or a job; gives its identifier.
-async fn made(client: &Client, path: &str, body: &Value) -> Result<String> {
-    Ok(client.made(path, body, &Uuid::now_v7().to_string()).await?)
+/// Creates a calibration, a measurement or a job, and returns its identifier.
+async fn create(client: &Client, path: &str, body: &Value) -> Result<String> {
+    Ok(client.create_checked(path, body, &Uuid::now_v7().to_string()).await?)
 }
 
-/// Fetches the EXR frames of snapshot 0 and its movie into `folder`, and reads the frames: \[B,H,W\].
+/// Downloads the EXR frames of snapshot 0 and its movie to `folder`. Returns the frames \[B,H,W\] and the movie's path.
 async fn results_of(client: &Client, job: &str, folder: &Path) -> Result<(Array3<f32>, PathBuf)> {
     let job = &client.job(job, 0).await?;
     let files = client.fetch(job, &[Wanted::Frames, Wanted::Movie], folder).await?;
@@ -130,11 +130,11 @@ async fn results_of(client: &Client, job: &str, folder: &Path) -> Result<(Array3
     Ok((frames, movie))
 }
 
-/// Processor seconds that the job's computing took, from its manifest.
+/// Reads the processor seconds of a job from its manifest.
 async fn cpu_seconds(client: &Client, job: &str) -> Result<f64> {
     let manifest = client.get(&format!("/v1/jobs/{job}/manifest.json")).await?;
     let seconds = manifest["run"]["cpu_seconds"].as_f64();
-    seconds.ok_or_else(|| CliError::Failure("the manifest tells no cpu_seconds".into()))
+    seconds.ok_or_else(|| CliError::Failure("the manifest has no cpu_seconds".into()))
 }
 
 /// Shows the progress of all jobs until they have succeeded.
@@ -153,23 +153,23 @@ async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<()> {
         }
         tokio::time::sleep(POLL).await;
     }
-    // The bars are for looking at: that they can't be cleared is no failure of the demo.
+    // The demo does not depend on the bars. A failure to clear them is ignored.
     let _ = screen.clear();
     Ok(())
 }
 
-/// The absolute path of an empty folder: new, or that of an earlier demo.
+/// Creates an empty folder, or clears the folder of an earlier demo. Returns the absolute path.
 fn fresh_folder(out: &Path) -> Result<PathBuf> {
     let unwritable = |error: std::io::Error| CliError::file("write", out, &error);
     fs::create_dir_all(out).map_err(unwritable)?;
     let mut entries = fs::read_dir(out).map_err(unwritable)?;
     if entries.next().is_some() && !out.join(REPORT).is_file() {
         return Err(CliError::Input(format!(
-            "{} is not empty and not the folder of an earlier demo: name a new one with --out",
+            "{} is not empty and not the folder of an earlier demo: choose a new one with --out",
             out.display()
         )));
     }
-    // Marked before anything else is made, so that a demo that is broken off can be repeated.
+    // Written first, so that an interrupted demo can be repeated.
     fs::write(out.join(REPORT), "{}\n").map_err(unwritable)?;
     for part in PARTS.map(|part| out.join(part)) {
         let removed = if part.is_dir() { fs::remove_dir_all(part) } else { fs::remove_file(part) };

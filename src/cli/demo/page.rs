@@ -1,4 +1,4 @@
-//! The page at the end of the demo: what went in, what came out, and how far it is from the truth.
+//! The page that the demo writes: the measurement, the reconstructions, and their differences from the truth.
 
 use std::fs;
 use std::path::Path;
@@ -11,10 +11,10 @@ use crate::cli::CliError;
 use crate::cli::error::Result;
 use formats::{Channels, Limits, png, read_stack};
 
-/// The folder of its pictures.
+/// The folder of the page's pictures.
 pub(super) const PICTURES: &str = "pictures";
-/// Differences are shown so many times as bright.
-const BRIGHTER: f32 = 4.0;
+/// Gain with which differences are shown.
+const GAIN: f32 = 4.0;
 
 const STYLE: &str = "body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; \
      background: #fff; color: #1b2026 } \
@@ -22,16 +22,22 @@ const STYLE: &str = "body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem a
      img, video { width: 256px; image-rendering: pixelated; background: #000; display: block } \
      th, td { padding: .1rem 1.5rem .1rem 0; text-align: right } th:first-child, td:first-child { text-align: left }";
 
-/// What a job has made, and where its files are below the demo's folder.
-pub(super) struct Made {
+/// The results of a job.
+pub(super) struct Reconstruction {
     pub(super) name: &'static str,
     pub(super) frames: Array3<f32>,
+    /// Path of the movie below the demo's folder.
     pub(super) movie: String,
 }
 
-/// Writes `report.html` and its pictures: the measurement, the movies, and of the middle frame the truth,
-/// what came of it, and the difference.
-pub(super) fn write(out: &Path, truth: &Array3<f32>, made: &[Made], report: &Report) -> Result<()> {
+/// Writes `report.html` and its pictures. It shows the measurement, the movies, and for the middle frame the truth, the
+/// reconstructions and their differences.
+pub(super) fn write(
+    out: &Path,
+    truth: &Array3<f32>,
+    reconstructions: &[Reconstruction],
+    report: &Report,
+) -> Result<()> {
     let folder = out.join(PICTURES);
     let unwritable = |path: &Path, error| CliError::file("write", path, &error);
     fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, error))?;
@@ -49,24 +55,25 @@ pub(super) fn write(out: &Path, truth: &Array3<f32>, made: &[Made], report: &Rep
     let brightest = measurement.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
     let measured = picture("measurement", measurement, brightest)?;
     let true_frame = truth.index_axis(Axis(0), middle);
-    let mut stills = vec![("truth", picture("truth", true_frame, 1.0)?, None)];
-    for Made { name, frames, .. } in made {
+    let mut pictures = vec![("truth", picture("truth", true_frame, 1.0)?, None)];
+    for Reconstruction { name, frames, .. } in reconstructions {
         let frame = frames.index_axis(Axis(0), middle);
         let difference = (&frame - &true_frame).mapv(f32::abs);
-        let difference = picture(&format!("{name}-difference"), difference.view(), 1.0 / BRIGHTER)?;
-        stills.push((name, picture(name, frame, 1.0)?, Some(difference)));
+        let difference = picture(&format!("{name}-difference"), difference.view(), 1.0 / GAIN)?;
+        pictures.push((name, picture(name, frame, 1.0)?, Some(difference)));
     }
-    let text = page((middle, &measured), &stills, made, report).into_string();
+    let text = page((middle, &measured), &pictures, reconstructions, report).into_string();
     let path = out.join(PAGE);
     fs::write(&path, text).map_err(|error| unwritable(&path, error))
 }
 
-type Still<'a> = (&'a str, String, Option<String>);
+/// Name, picture and picture of the difference.
+type Picture<'a> = (&'a str, String, Option<String>);
 
 fn page(
     (middle, measured): (usize, &str),
-    stills: &[Still<'_>],
-    made: &[Made],
+    pictures: &[Picture<'_>],
+    reconstructions: &[Reconstruction],
     report: &Report,
 ) -> Markup {
     html! {
@@ -82,7 +89,7 @@ fn page(
                 h1 { "One snapshot, " (report.frames) " frames" }
                 div class="row" {
                     figure { img src=(measured) alt="The measurement"; figcaption { "the measurement" } }
-                    @for Made { name, movie, .. } in made {
+                    @for Reconstruction { name, movie, .. } in reconstructions {
                         figure {
                             video src=(movie) controls loop autoplay muted playsinline {}
                             figcaption { (name) }
@@ -102,13 +109,13 @@ fn page(
                 }
                 h2 { "Frame " (middle + 1) }
                 div class="row" {
-                    @for (name, still, _) in stills {
-                        figure { img src=(still) alt=(name); figcaption { (name) } }
+                    @for (name, picture, _) in pictures {
+                    figure { img src=(picture) alt=(name); figcaption { (name) } }
                     }
                 }
-                h2 { "Difference from the truth, " (BRIGHTER) " times as bright" }
+                h2 { "Difference from the truth, " (GAIN) " times as bright" }
                 div class="row" {
-                    @for (name, _, difference) in stills {
+                    @for (name, _, difference) in pictures {
                         @if let Some(difference) = difference {
                             figure { img src=(difference) alt={ "Difference of " (name) }; figcaption { (name) } }
                         }

@@ -1,4 +1,4 @@
-//! What the demo found.
+//! The comparison of the demo's results with the truth.
 
 use std::path::PathBuf;
 
@@ -11,7 +11,7 @@ use crate::cli::output::print_line;
 use engine::pipeline::quality::{self, FrameQuality};
 use formats::Channels;
 
-/// The page that shows it.
+/// File name of the page.
 pub(super) const PAGE: &str = "report.html";
 
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -22,7 +22,7 @@ pub(super) struct Quality {
     pub(super) cpu_seconds: f64,
 }
 
-/// What `--json` prints, and `demo.json`.
+/// The content of `demo.json`, which `--json` prints.
 #[derive(Debug, Serialize)]
 pub(super) struct Report {
     pub(super) gap_tv: Quality,
@@ -55,7 +55,7 @@ impl Report {
             .map_err(|error| CliError::Failure(format!("the report: {error}")))
     }
 
-    /// The algorithms that were compared.
+    /// Name and quality of each algorithm.
     pub(super) fn rows(&self) -> [(&'static str, Quality); 2] {
         [("gap-tv", self.gap_tv), ("pnp-tv-fastdvdnet", self.pnp_tv_fastdvdnet)]
     }
@@ -76,7 +76,9 @@ impl Report {
             self.seconds
         ))?;
         let out = self.output_dir.display();
-        print_line(format!("To look at them: {out}/{PAGE}. The dashboard on the same data:"))?;
+        print_line(format!(
+            "View the results in {out}/{PAGE}. To open the dashboard on the same data:"
+        ))?;
         print_line(format!("sci-recon serve --data {out}/service"))?;
         print_line(format!(
             "The downloaded frames are in {out}/frames, the true ones in {out}/input/clip."

@@ -1,4 +1,4 @@
-//! The service as a process of its own.
+//! Runs the service as a separate process.
 
 use std::fs::File;
 use std::path::Path;
@@ -12,7 +12,7 @@ use tokio::process::{Child, Command};
 use crate::cli::CliError;
 use crate::cli::error::Result;
 
-/// How long the service may take to start, and to stop.
+/// Time that the service has to start, and to stop.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A running service. It is killed if this is dropped.
@@ -35,8 +35,9 @@ impl Service {
             let log = out.join("service.log");
             CliError::Failure(format!("the service {what}; see {}", log.display()))
         };
-        let program = std::env::current_exe()
-            .map_err(|error| CliError::Failure(format!("the program's own path: {error}")))?;
+        let program = std::env::current_exe().map_err(|error| {
+            CliError::Failure(format!("the program can't find its path: {error}"))
+        })?;
         let log = File::create(out.join("service.log"))
             .map_err(|error| CliError::file("write", &out.join("service.log"), &error))?;
         let mut process = Command::new(program)
@@ -54,7 +55,7 @@ impl Service {
         let line = line.ok().and_then(Result::ok).flatten();
         let line = line.ok_or_else(|| failed("did not start"))?;
         let announced: Announcement = serde_json::from_str(&line)
-            .map_err(|error| failed(&format!("announced itself wrongly ({error})")))?;
+            .map_err(|error| failed(&format!("printed an invalid address ({error})")))?;
         Ok(Self { process, url: announced.url })
     }
 
@@ -62,7 +63,7 @@ impl Service {
         &self.url
     }
 
-    /// Stops it and waits for its end.
+    /// Stops the service and waits for its end.
     pub(super) async fn stop(mut self) -> Result<()> {
         let failed =
             |text: String| CliError::Failure(format!("the service can't be stopped: {text}"));
@@ -73,7 +74,7 @@ impl Service {
         }
         match tokio::time::timeout(PATIENCE, self.process.wait()).await {
             Ok(status) => status.map(drop).map_err(|error| failed(error.to_string())),
-            // Dropping it kills it.
+            // Dropping the process kills it.
             Err(_) => Ok(()),
         }
     }

@@ -1,4 +1,4 @@
-//! The raw captures that a lab would take: 16-bit numbers and an index.
+//! Simulates the raw captures that a lab would take: 16-bit numbers and an index.
 
 use std::fs;
 use std::path::Path;
@@ -11,22 +11,22 @@ use crate::cli::error::Result;
 use formats::npy;
 use optics::{Camera, generator, measure};
 
-/// Share of the background that the lithography mask lets through.
+/// Share of the background that the lithography mask transmits.
 const BACKGROUND_THROUGH_MASK: f64 = 0.5;
 
-/// `captures.json`: which files hold the repeats of which capture, and what their numbers mean.
+/// The content of `captures.json`: the files of each capture, and the scale of their numbers.
 #[derive(Debug, Serialize)]
 struct Index {
     schema: &'static str,
     /// For each pattern, the files with captures of the white board through the mask.
     masks: Vec<Vec<String>>,
-    /// The same with the LCoS all black.
+    /// Captures through the mask with the LCoS all black.
     black_with_mask: Vec<String>,
-    /// Without the mask, the LCoS all white.
+    /// Captures without the mask, with the LCoS all white.
     white: Vec<String>,
-    /// Without the mask, the LCoS all black.
+    /// Captures without the mask, with the LCoS all black.
     black: Vec<String>,
-    /// A pixel with this number is full.
+    /// The number of a saturated pixel.
     saturation: u16,
     measurement: Measurement,
 }
@@ -34,7 +34,7 @@ struct Index {
 #[derive(Debug, Serialize)]
 struct Measurement {
     data: String,
-    /// The LCoS all black, at the exposure of the measurement.
+    /// Captures with the LCoS all black, at the exposure of the measurement.
     dark: Vec<String>,
     /// The number that means 1 after the dark is subtracted, with masks whose largest value is 1.
     full_scale: f32,
@@ -47,15 +47,15 @@ pub(super) struct Lab<'a> {
     pub(super) illumination: ArrayView2<'a, f32>,
     /// Masks \[B,H,W\].
     pub(super) masks: ArrayView3<'a, f32>,
-    /// Share of the whole aperture's light where a mask is 1.
+    /// Share of the whole aperture's light that a mask value of 1 transmits.
     pub(super) scale: f32,
     pub(super) repeats: usize,
     pub(super) seed: u64,
 }
 
 impl Lab<'_> {
-    /// Writes all captures of a calibration, and the measurement of `scene` (its frames one snapshot
-    /// after the other, with the illumination in them). Gives the measurement's full scale.
+    /// Writes all captures of a calibration, and the measurement of `scene`. The scene contains the frames of all
+    /// snapshots in order, with the illumination. Returns the measurement's full scale.
     pub(super) fn write(
         &self,
         folder: &Path,
@@ -66,7 +66,7 @@ impl Lab<'_> {
         let camera = self.camera;
         let dim = self.illumination.dim();
         let (exposure, closed) = (single(camera.calibration_exposure), Array2::zeros(dim));
-        let with_mask = camera.background * BACKGROUND_THROUGH_MASK;
+        let masked_background = camera.background * BACKGROUND_THROUGH_MASK;
         let mut shots = Shots { lab: self, folder, stream: 2 };
         let mut masks = Vec::new();
         for (index, mask) in self.masks.outer_iter().enumerate() {
@@ -74,20 +74,20 @@ impl Lab<'_> {
             masks.push(vec![shots.take(
                 &format!("mask_{:02}.npy", index + 1),
                 &light,
-                with_mask,
+                masked_background,
             )?]);
         }
         let white = &self.illumination * exposure;
         let index = Index {
             schema: "sci-recon/captures/1",
             masks,
-            black_with_mask: vec![shots.take("black_with_mask.npy", &closed, with_mask)?],
+            black_with_mask: vec![shots.take("black_with_mask.npy", &closed, masked_background)?],
             white: vec![shots.take("white.npy", &white, camera.background)?],
             black: vec![shots.take("black.npy", &closed, camera.background)?],
             saturation: camera.saturation(),
             measurement: Measurement {
-                dark: vec![shots.take("scene_black.npy", &closed, with_mask)?],
-                data: self.snapshots(&mut shots, snapshots, scene, with_mask)?,
+                dark: vec![shots.take("scene_black.npy", &closed, masked_background)?],
+                data: self.snapshots(&mut shots, snapshots, scene, masked_background)?,
                 full_scale: self.full_scale(),
                 saturation: camera.saturation(),
             },
@@ -120,16 +120,16 @@ impl Lab<'_> {
     }
 }
 
-/// Takes captures, each with noise of its own.
+/// Takes captures with independent noise.
 struct Shots<'s, 'a> {
     lab: &'s Lab<'a>,
     folder: &'s Path,
-    /// Of the random generator: 0 makes masks, 1 the noise of the float measurement.
+    /// Stream of the random generator. Streams 0 and 1 serve the masks and the noise of the float measurement.
     stream: u64,
 }
 
 impl Shots<'_, '_> {
-    /// All repeats of one capture; gives the file's name.
+    /// Writes all repeats of one capture, and returns the file's name.
     fn take(&mut self, name: &str, light: &Array2<f32>, background: f64) -> Result<String> {
         self.write(name, self.lab.repeats, |_| (light, background))
     }
@@ -153,7 +153,7 @@ impl Shots<'_, '_> {
     }
 }
 
-#[allow(clippy::cast_possible_truncation)] // to the precision of pictures
+#[allow(clippy::cast_possible_truncation)] // pictures have single precision
 fn single(value: f64) -> f32 {
     value as f32
 }

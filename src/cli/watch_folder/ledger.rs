@@ -1,4 +1,4 @@
-//! The state of each file of a watched folder, one JSON object per line. The last line of a file is valid.
+//! The ledger of a watched folder: the state of each file, one JSON object per line. The last line about a file is valid.
 //! A line is on the disk before the step that it announces, so no step is repeated under another key.
 
 use std::collections::HashMap;
@@ -54,7 +54,7 @@ pub(super) struct Entry {
     pub(super) key: String,
     /// The requests, as decided when the file was recorded.
     pub(super) recipe: Recipe,
-    /// Name of the results, or of the reason of a failure; it was free.
+    /// Name of the results or of the failure's reason. No file had the name when the entry was made.
     pub(super) results: String,
     #[serde(flatten)]
     pub(super) stage: Stage,
@@ -68,7 +68,7 @@ pub(super) struct Ledger {
 
 impl Ledger {
     /// Opens or creates the ledger of a folder.
-    /// Errors: another process has it open; a line can't be read.
+    /// Errors: another process uses it; a line can't be read.
     pub(super) fn open(path: PathBuf) -> Result<Self> {
         let failed = |error: std::io::Error| CliError::file("open", &path, &error);
         let mut options = OpenOptions::new();
@@ -78,14 +78,13 @@ impl Ledger {
             CliError::Input(format!("{}: {text} ({error})", path.display()))
         })?;
         let text = fs::read_to_string(&path).map_err(failed)?;
-        // An incomplete last line announces a step that was not begun.
-        let whole = text.rfind('\n').map_or(0, |end| end + 1);
-        file.set_len(whole as u64).map_err(failed)?;
+        // The step after an incomplete last line was not started.
+        let complete = text.rfind('\n').map_or(0, |end| end + 1);
+        file.set_len(complete as u64).map_err(failed)?;
         let mut entries = HashMap::new();
-        for (number, line) in text[..whole].lines().enumerate() {
+        for (number, line) in text[..complete].lines().enumerate() {
             let entry: Entry = serde_json::from_str(line).map_err(|error| {
-                let place = format!("{}, line {}", path.display(), number + 1);
-                CliError::Input(format!("{place}: {error}"))
+                CliError::Input(format!("{}, line {}: {error}", path.display(), number + 1))
             })?;
             entries.insert(entry.shot.clone(), entry);
         }
@@ -110,7 +109,7 @@ impl Ledger {
     }
 
     /// Records the progress of a file. It is on the disk when this returns.
-    pub(super) fn note(&mut self, entry: Entry) -> Result<()> {
+    pub(super) fn record(&mut self, entry: Entry) -> Result<()> {
         let failed = |error: std::io::Error| CliError::file("write", &self.path, &error);
         let line = serde_json::to_string(&entry).map_err(|error| failed(error.into()))?;
         self.file.write_all(format!("{line}\n").as_bytes()).map_err(failed)?;
@@ -120,8 +119,8 @@ impl Ledger {
     }
 }
 
-/// The name of a ledger in its folder.
-pub(super) fn place(folder: &Path) -> PathBuf {
+/// Path of the ledger of a folder.
+pub(super) fn path_in(folder: &Path) -> PathBuf {
     folder.join(".sci-recon.ledger")
 }
 
@@ -139,21 +138,21 @@ mod tests {
     }
 
     #[test]
-    fn the_last_whole_line_of_a_file_holds() {
+    fn the_last_complete_line_about_a_file_is_valid() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("ledger");
         let mut ledger = Ledger::open(path.clone()).unwrap();
         assert!(Ledger::open(path.clone()).is_err(), "one process at a time");
-        ledger.note(entry("a", Stage::Taken)).unwrap();
-        ledger.note(entry("b", Stage::Taken)).unwrap();
-        ledger.note(entry("a", Stage::Done { job: "j".into() })).unwrap();
+        ledger.record(entry("a", Stage::Taken)).unwrap();
+        ledger.record(entry("b", Stage::Taken)).unwrap();
+        ledger.record(entry("a", Stage::Done { job: "j".into() })).unwrap();
         drop(ledger);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, format!("{text}{{\"name\": \"c\", \"si")).unwrap();
         let mut ledger = Ledger::open(path.clone()).unwrap();
         assert_eq!(ledger.open_entries(), [entry("b", Stage::Taken)]);
         assert!(ledger.has(&entry("a", Stage::Taken).shot) && ledger.has_results("b.result"));
-        ledger.note(entry("b", Stage::Failed { reason: "r".into() })).unwrap();
+        ledger.record(entry("b", Stage::Failed { reason: "r".into() })).unwrap();
         drop(ledger);
         assert!(Ledger::open(path.clone()).unwrap().open_entries().is_empty());
         fs::write(&path, "nonsense\n").unwrap();

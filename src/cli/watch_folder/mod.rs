@@ -1,9 +1,9 @@
-//! `sci-recon watch-folder`: turns each file of a folder into a job, and puts the results beside it.
+//! `sci-recon watch-folder`: submits each file of a folder as a job, and puts the results next to the file.
 //!
 //! 1. When a file stops growing, a line in the ledger gives it a permanent key.
 //! 2. The file is uploaded, and a measurement and a job are created with that key. Repeated requests with the
 //!    key return the same job.
-//! 3. If the job succeeds, its results are downloaded; if it fails, a file has the reason.
+//! 3. If the job succeeds, its results are downloaded. If it fails, the reason is written to a file.
 //!
 //! Each step can be repeated from its start. A kill at any moment loses nothing and creates nothing twice.
 
@@ -22,7 +22,7 @@ use serde_json::json;
 use uuid::Uuid;
 
 use super::CliError;
-use super::client::{Client, ClientError, Job, ServiceArguments, Wanted, place};
+use super::client::{Client, ClientError, Job, ServiceArguments, Wanted, rename_new};
 use super::error::Result;
 use super::output::print_line;
 use super::submission::{Recipe, SubmissionArguments};
@@ -33,14 +33,14 @@ use ledger::{Entry, Ledger, Shot, Stage};
 
 /// Extensions of files that may hold snapshots. The service detects the format by the content.
 const ENDINGS: [&str; 7] = ["npy", "tif", "tiff", "png", "mat", "h5", "hdf5"];
-/// Verdict and findings, in the folder of the results.
+/// File with verdict and findings, in the folder of the results.
 const REPORT: &str = "REPORT.txt";
-/// Pause between two looks at the folder.
-const LOOK: Duration = Duration::from_millis(500);
+/// Time between two scans of the folder.
+const POLL: Duration = Duration::from_millis(500);
 
-/// Turn each file that appears in a folder into a job.
+/// Submit each file that appears in a folder as a job.
 ///
-/// A file is submitted when it stops growing. Its results come into NAME.result beside it, with a
+/// A file is submitted when it stops growing. The results are written to NAME.result in the same folder, with a
 /// REPORT.txt; if the job fails, NAME.failed.txt has the reason. The command may be stopped and started at any
 /// time. With --once it ends with 1 if a job failed, and with 3 if the checks found errors in a file.
 #[derive(Debug, Args)]
@@ -73,21 +73,28 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let folder = folder.map_err(|error| CliError::file("watch", &arguments.folder, &error))?;
     wait(async {
         let client = Client::new(&arguments.service)?;
-        let ledger = Ledger::open(ledger::place(&folder))?;
-        let own = arguments
+        let ledger = Ledger::open(ledger::path_in(&folder))?;
+        let excluded = arguments
             .submission
             .own_files()
             .map(|file| file.canonicalize().map_err(|error| CliError::file("read", file, &error)));
-        let own = own.collect::<Result<_>>()?;
-        let (seen, failed, errors) = (HashMap::new(), 0, Vec::new());
-        let mut watch =
-            Watch { arguments, client, folder, own, settle, ledger, seen, failed, errors };
+        let mut watch = Watch {
+            arguments,
+            client,
+            folder,
+            excluded: excluded.collect::<Result<_>>()?,
+            settle,
+            ledger,
+            growing: HashMap::new(),
+            failed: 0,
+            findings: Vec::new(),
+        };
         watch.run().await?;
         if watch.failed > 0 {
             let text = format!("{} files have failed; see their .failed.txt", watch.failed);
             return Err(CliError::Failure(text));
         }
-        verdict::refuse_errors([&*watch.errors])
+        verdict::refuse_errors([&*watch.findings])
     })
 }
 
@@ -95,16 +102,16 @@ struct Watch<'a> {
     arguments: &'a Arguments,
     client: Client,
     folder: PathBuf,
-    /// Masks and dark captures, which may be in the folder, too.
-    own: Vec<PathBuf>,
+    /// Masks and dark captures, which may be in the same folder.
+    excluded: Vec<PathBuf>,
     settle: Duration,
     ledger: Ledger,
     /// Files that may still grow, with the time of their last observed change.
-    seen: HashMap<Shot, Instant>,
+    growing: HashMap<Shot, Instant>,
     /// Files that have failed since the start.
     failed: usize,
     /// Findings of the jobs that have ended since the start.
-    errors: Vec<Finding>,
+    findings: Vec<Finding>,
 }
 
 impl Watch<'_> {
@@ -112,44 +119,44 @@ impl Watch<'_> {
         let recipe = loop {
             match self.arguments.submission.recipe(&self.client).await {
                 Ok(recipe) => break recipe,
-                Err(ClientError::Passing(reason)) => self.waiting(&reason).await,
+                Err(ClientError::Temporary(reason)) => self.wait_for_service(&reason).await,
                 Err(error) => return Err(error.into()),
             }
         };
         loop {
-            let settled = self.look()?;
-            let quiet = settled.is_empty() && self.seen.is_empty();
+            let settled = self.scan()?;
+            let is_quiet = settled.is_empty() && self.growing.is_empty();
             for shot in settled {
                 self.take(shot, &recipe)?;
             }
             for entry in self.ledger.open_entries() {
                 self.advance(entry).await?;
             }
-            if self.arguments.once && quiet && self.ledger.open_entries().is_empty() {
+            if self.arguments.once && is_quiet && self.ledger.open_entries().is_empty() {
                 return Ok(());
             }
-            tokio::time::sleep(LOOK.min(self.settle.max(Duration::from_millis(50)))).await;
+            tokio::time::sleep(POLL.min(self.settle.max(Duration::from_millis(50)))).await;
         }
     }
 
-    /// New files that have stopped growing, by modification time.
-    fn look(&mut self) -> Result<Vec<Shot>> {
+    /// Finds new files that have stopped growing. Returns them in order of modification time.
+    fn scan(&mut self) -> Result<Vec<Shot>> {
         let unreadable = |error: std::io::Error| CliError::file("read", &self.folder, &error);
-        let (now, mut seen, mut settled) = (Instant::now(), HashMap::new(), Vec::new());
-        for found in fs::read_dir(&self.folder).map_err(unreadable)? {
-            let path = found.map_err(unreadable)?.path();
+        let (now, mut growing, mut settled) = (Instant::now(), HashMap::new(), Vec::new());
+        for entry in fs::read_dir(&self.folder).map_err(unreadable)? {
+            let path = entry.map_err(unreadable)?.path();
             let Some(shot) = shot(&path) else { continue };
-            if self.ledger.has(&shot) || self.own.contains(&path) {
+            if self.ledger.has(&shot) || self.excluded.contains(&path) {
                 continue;
             }
-            let since = self.seen.get(&shot).copied().unwrap_or(now);
+            let since = self.growing.get(&shot).copied().unwrap_or(now);
             if now - since >= self.settle && shot.size > 0 {
                 settled.push(shot);
             } else if shot.size > 0 {
-                seen.insert(shot, since);
+                growing.insert(shot, since);
             }
         }
-        self.seen = seen;
+        self.growing = growing;
         settled.sort_by(|a, b| (a.time, &a.name).cmp(&(b.time, &b.name)));
         Ok(settled)
     }
@@ -163,14 +170,14 @@ impl Watch<'_> {
             .find(|name| self.is_free(name));
         let results = results.unwrap_or_else(|| shot.name.clone());
         let key = Uuid::now_v7().to_string();
-        self.note(Entry { shot, key, recipe: recipe.clone(), results, stage: Stage::Taken })
+        self.record(Entry { shot, key, recipe: recipe.clone(), results, stage: Stage::Taken })
     }
 
     /// True if no file and no entry uses the names of these results.
     fn is_free(&self, name: &str) -> bool {
-        let taken = [result_folder(name), failure_file(name)];
+        let paths = [result_folder(name), failure_file(name)];
         let exists = |name: &String| self.folder.join(name).symlink_metadata().is_ok();
-        !self.ledger.has_results(name) && !taken.iter().any(exists)
+        !self.ledger.has_results(name) && !paths.iter().any(exists)
     }
 
     /// Takes the next step for a file.
@@ -183,31 +190,31 @@ impl Watch<'_> {
         let stage = match step {
             Ok(None) => return Ok(()),
             Ok(Some(stage)) => stage,
-            Err(ClientError::Passing(reason)) => {
-                self.waiting(&reason).await;
+            Err(ClientError::Temporary(reason)) => {
+                self.wait_for_service(&reason).await;
                 return Ok(());
             }
-            // A wrong address or certificate, or a missing permission, is no fault of the file.
+            // The file does not cause a wrong address or certificate, or a missing permission.
             Err(error @ ClientError::Unreachable(_)) => return Err(error.into()),
             Err(ClientError::Refused { status, code, detail })
                 if [StatusCode::UNAUTHORIZED, StatusCode::FORBIDDEN].contains(&status) =>
             {
                 return Err(ClientError::Refused { status, code, detail }.into());
             }
-            // Neither is a full disk here: the next start fetches the results.
-            Err(ClientError::Here(error @ CliError::Failure(_)))
+            // It does not cause a full disk either. The next start downloads the results.
+            Err(ClientError::Local(error @ CliError::Failure(_)))
                 if matches!(entry.stage, Stage::Submitted { .. }) =>
             {
                 return Err(error);
             }
             Err(error @ ClientError::Refused { .. }) => Stage::Failed { reason: error.to_string() },
-            Err(ClientError::Here(error)) => Stage::Failed { reason: error.to_string() },
+            Err(ClientError::Local(error)) => Stage::Failed { reason: error.to_string() },
         };
         if let Stage::Failed { reason } = &stage {
             self.failed += 1;
-            self.explain(&entry, reason)?;
+            self.write_failure(&entry, reason)?;
         }
-        self.note(Entry { stage, ..entry })
+        self.record(Entry { stage, ..entry })
     }
 
     async fn submit(&self, entry: &Entry) -> Result<Option<Stage>, ClientError> {
@@ -215,15 +222,15 @@ impl Watch<'_> {
         let changed = || {
             Stage::Failed {
             reason:
-                "the file was changed or removed while it was submitted; a changed file is submitted \
-                     as a new one"
+                "the file was changed or removed during the submission; a changed file is submitted as a new \
+                one"
                     .into(),
         }
         };
         if shot(&path).as_ref() != Some(&entry.shot) {
             return Ok(Some(changed()));
         }
-        let data = self.client.sent(&path).await?;
+        let data = self.client.upload_with_bar(&path).await?;
         if shot(&path).as_ref() != Some(&entry.shot) {
             return Ok(Some(changed()));
         }
@@ -249,7 +256,7 @@ impl Watch<'_> {
         Ok(Some(Stage::Done { job: job.id }))
     }
 
-    /// Prints verdict and findings, and writes them to the folder of the results.
+    /// Prints verdict and findings, and writes them to the results' folder.
     fn write_report(&mut self, entry: &Entry, job: &Job, folder: &Path) -> Result<()> {
         let findings = job.findings();
         if self.arguments.json {
@@ -272,56 +279,56 @@ impl Watch<'_> {
             job.algorithm,
             job.created_at,
         );
-        self.errors.extend(findings);
+        self.findings.extend(findings);
         fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
         write_new(&folder.join(REPORT), &text)
     }
 
-    /// Writes the reason of a failure beside the file.
-    fn explain(&self, entry: &Entry, reason: &str) -> Result<()> {
+    /// Writes the reason of a failure to a file next to the submitted one.
+    fn write_failure(&self, entry: &Entry, reason: &str) -> Result<()> {
         let path = self.folder.join(failure_file(&entry.results));
         let text =
             format!("{}: {reason}\n\nTo try again: touch {:?}\n", entry.shot.name, entry.shot.name);
         write_new(&path, &text)
     }
 
-    fn note(&mut self, entry: Entry) -> Result<()> {
+    fn record(&mut self, entry: Entry) -> Result<()> {
         if self.arguments.json {
             let state = &entry.stage;
             print_line(json!({"file": entry.shot.name, "size": entry.shot.size, "step": state}))?;
         } else {
-            let told = match &entry.stage {
-                Stage::Taken => "is sent".to_owned(),
+            let step = match &entry.stage {
+                Stage::Taken => "is being uploaded".to_owned(),
                 Stage::Submitted { job } => format!("is job {job}"),
                 Stage::Done { .. } => format!("is in {}", result_folder(&entry.results)),
                 Stage::Failed { reason } => format!("has failed: {reason}"),
             };
-            print_line(format!("{} {told}", entry.shot.name))?;
+            print_line(format!("{} {step}", entry.shot.name))?;
         }
-        self.ledger.note(entry)
+        self.ledger.record(entry)
     }
 
-    /// Prints why the service is not available, and waits.
-    async fn waiting(&self, reason: &str) {
+    /// Prints why the service is unavailable, and waits.
+    async fn wait_for_service(&self, reason: &str) {
         eprintln!("sci-recon: {reason}; trying again");
         tokio::time::sleep(Duration::from_secs(2)).await;
     }
 }
 
-/// Writes a text file, completely or not at all. A file with the same text may be there.
+/// Writes a text file, completely or not at all. A file with the same text may exist.
 fn write_new(path: &Path, text: &str) -> Result<()> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let made = path.with_file_name(format!(".{name}.part"));
+    let draft = path.with_file_name(format!(".{name}.part"));
     let write = || -> std::io::Result<()> {
-        let mut file = File::create(&made)?;
+        let mut file = File::create(&draft)?;
         file.write_all(text.as_bytes())?;
         file.sync_all()
     };
-    write().map_err(|error| CliError::file("write", &made, &error))?;
-    match place(&made, path) {
-        // It was written before the ledger could say so.
-        Err(_) if fs::read_to_string(path).is_ok_and(|there| there == text) => {
-            fs::remove_file(&made).map_err(|error| CliError::file("remove", &made, &error))
+    write().map_err(|error| CliError::file("write", &draft, &error))?;
+    match rename_new(&draft, path) {
+        // An earlier process wrote it, and was killed before it updated the ledger.
+        Err(_) if fs::read_to_string(path).is_ok_and(|existing| existing == text) => {
+            fs::remove_file(&draft).map_err(|error| CliError::file("remove", &draft, &error))
         }
         placed => placed,
     }
@@ -335,7 +342,7 @@ fn failure_file(name: &str) -> String {
     format!("{name}.failed.txt")
 }
 
-/// The state of a file; none unless it is a regular file that may hold snapshots.
+/// The state of a regular file that may contain snapshots. `None` for all other paths.
 fn shot(path: &Path) -> Option<Shot> {
     let name = path.file_name()?.to_str().filter(|name| !name.starts_with('.'))?;
     let ending = path.extension()?.to_str()?.to_ascii_lowercase();

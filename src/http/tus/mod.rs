@@ -114,7 +114,7 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
     // More is reserved as it grows.
     let first = length.min(FIRST_RESERVE);
     let begin = app.store.begin_partial(facts, app.settings.upload_age(), key.as_ref());
-    let inserted = app.admission.with_room("the upload", first, begin).await?;
+    let inserted = app.admission.with_room(&lab, ("the upload", first), begin).await?;
     begun(&app, &lab, inserted).await
 }
 
@@ -219,7 +219,8 @@ async fn piece(
     // Of a piece that does not say its length, room is reserved as it comes.
     let length = text(headers, &header::CONTENT_LENGTH)?.and_then(|text| text.parse().ok());
     let length: u64 = length.unwrap_or_default();
-    let room = app.admission.reserve(length.min(upload.facts.length - upload.received)).await?;
+    let length = length.min(upload.facts.length - upload.received);
+    let room = app.admission.reserve(&access.lab, length).await?;
     let file = append::append(app, file, room, checksum, body).await?;
     finish(app, file).await
 }

@@ -29,7 +29,7 @@ def main():
         file["mask"] = masks.astype("<i8")
         file["meas"] = snapshots.astype("<f2")
         file["orig"] = snapshots.astype(complex)
-    # MATLAB's layout: a block of 512 bytes before the file, axes in reverse, the class as an attribute.
+    # MATLAB's layout has a block of 512 bytes before the file, reversed axes, and the class as an attribute.
     path = HERE / "matlab73.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values, matlab in [

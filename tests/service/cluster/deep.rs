@@ -19,7 +19,7 @@ async fn networks_give_the_same_bytes_on_other_machines() {
     let Some(nats) = Nats::start(1) else { return };
     let app = TestApp::with(&["--workers", "2"]).await;
     let (calibration, measurement) = app.scene(&Scene::SMALL).await;
-    // Two tiles: a few passes here, and in `make cluster` the default schedule with its pilot.
+    // The job has two tiles. It runs a few passes here, and the default schedule with its pilot in `make cluster`.
     let mut deep = json!({
         "measurement": measurement, "algorithm": "pnp-tv-fastdvdnet", "snapshots": 0,
         "tile": {"size": 48, "overlap": 16},
@@ -30,7 +30,7 @@ async fn networks_give_the_same_bytes_on_other_machines() {
             {"prior": "tv+fastdvdnet", "iterations": 3, "sigma": [0.2, 0.05], "tv_weight": 0.02}]});
     }
     let mut bodies = vec![deep];
-    let mut own = None;
+    let mut own_model = None;
     if let Some(python) = learned::python() {
         let folder = tempfile::tempdir().unwrap();
         let file = learned::train(&python, folder.path(), Scene::SMALL, "free");
@@ -39,17 +39,17 @@ async fn networks_give_the_same_bytes_on_other_machines() {
             "measurement": measurement, "algorithm": "learned", "model": model["id"], "snapshots": 0,
             "tile": {"size": 32, "overlap": 16},
         }));
-        own = Some(model["file"].as_str().unwrap().to_owned());
+        own_model = Some(model["file"].as_str().unwrap().to_owned());
     }
     let run = async |app: &TestApp| {
-        let mut found = Vec::new();
+        let mut hashes = Vec::new();
         for body in &bodies {
             let job = app.submit(body).await;
             let done = app.ended(&job).await;
             assert_eq!(done["state"], "succeeded", "{done:#}");
-            found.push(results_of(app, &job, 1).await);
+            hashes.push(results_of(app, &job, 1).await);
         }
-        found
+        hashes
     };
     let expected = run(&app).await;
     let url = nats.url();
@@ -57,7 +57,7 @@ async fn networks_give_the_same_bytes_on_other_machines() {
     let both = [worker(&nats, &[]), worker(&nats, &[])];
     assert_eq!(run(&app).await, expected);
     assert_eq!(workers(&app).await.len(), 2);
-    if let Some(sha256) = own {
+    if let Some(sha256) = own_model {
         let cached = |folder: &std::path::Path| folder.join("cache").join(&sha256).exists();
         assert!(
             both.iter().any(|worker| cached(worker.folder.path())),

@@ -53,12 +53,12 @@ async fn a_credential_is_limited_to_the_subjects_of_its_pool() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&with_iterations(&measurement, 9000)).await;
     busy(&app).await;
-    let found = nats.subject_in("SCI_IN").await;
+    let input_subject = nats.subject_in("SCI_IN").await;
     let worker = workers(&app).await[0]["id"].as_str().unwrap().to_owned();
     let (client, refused) = intruder(&nats, "b").await;
 
     // Messages that only the pool's workers may publish. Each publication is rejected by name.
-    let direct = format!("$JS.API.DIRECT.GET.SCI_IN.{found}");
+    let direct = format!("$JS.API.DIRECT.GET.SCI_IN.{input_subject}");
     let publish = [
         "sci.v1.task.a",
         "sci.v1.task.b",
@@ -69,7 +69,7 @@ async fn a_credential_is_limited_to_the_subjects_of_its_pool() {
         "sci.v1.hello.a",
         "sci.v1.tell.a.x",
         "sci.v1.tell.b.x",
-        &found,
+        &input_subject,
         "sci.v1.in.b.x.0",
         "sci.v1.out.a.x.1.y.0",
         &direct,
@@ -147,7 +147,7 @@ async fn a_credential_is_limited_to_the_subjects_of_its_pool() {
     client.publish("sci.v1.beat.b", forged.to_string().into()).await.unwrap();
     client.flush().await.unwrap();
     tokio::time::sleep(Duration::from_millis(300)).await;
-    assert_eq!(workers(&app).await.len(), 1, "it is still there: {task:#}");
+    assert_eq!(workers(&app).await.len(), 1, "the worker is still known: {task:#}");
     assert_eq!(running(app.data(), &job).await, (task_id, attempt), "nobody has ended it");
     until("the forged event is dropped", || async { nats.messages().await == before }).await;
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
@@ -174,9 +174,9 @@ async fn a_revoked_credential_is_disconnected() {
     assert_eq!(std::fs::metadata(&lost).unwrap().permissions().mode() & 0o777, 0o600);
     let mut first = RemoteWorker::with_credential(&kept, &[]);
     let mut second = RemoteWorker::with_credential(&lost, &[]);
-    until("both are there", || async { workers(&app).await.len() == 2 }).await;
+    until("both workers are known", || async { workers(&app).await.len() == 2 }).await;
     let listed = nats.cluster(&["worker", "list"]).unwrap();
-    assert_eq!(listed.matches(" good ").count(), 2, "{listed}");
+    assert_eq!(listed.matches(" valid ").count(), 2, "{listed}");
     let start = Instant::now();
     let revoked = nats.cluster(&["worker", "revoke", "--pool", "lost"]).unwrap();
     assert_eq!(revoked, "revoked lost\n");
@@ -187,14 +187,14 @@ async fn a_revoked_credential_is_disconnected() {
     let heard =
         tokio::time::timeout(Duration::from_secs(7), futures_util::StreamExt::next(&mut beats));
     assert!(heard.await.is_err(), "the worker still sends heartbeats");
-    eprintln!("disconnected, as seen {:?} after the revocation began", start.elapsed());
+    eprintln!("disconnected at most {:?} after the start of the revocation", start.elapsed());
     let text = std::fs::read_to_string(&lost).unwrap();
-    let again = ConnectOptions::with_credentials(&text)
+    let reconnected = ConnectOptions::with_credentials(&text)
         .unwrap()
         .add_root_certificates(nats.keys().join("ca.pem"))
         .connect(format!("tls://127.0.0.1:{}", nats.ports[0]))
         .await;
-    assert!(again.is_err(), "it may not come back");
+    assert!(reconnected.is_err(), "a revoked credential can't connect");
     // The worker ends with the reason, and so does one that is started with the credential.
     let mut third = RemoteWorker::with_credential(&lost, &[]);
     for worker in [&mut second, &mut third] {
@@ -203,11 +203,11 @@ async fn a_revoked_credential_is_disconnected() {
     }
     let mut check = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
     let ran = check.args(["cluster", "check", "--nats-creds"]).arg(&lost).output().unwrap();
-    let said = String::from_utf8(ran.stderr).unwrap();
-    assert!(ran.status.code() == Some(2) && said.contains("authorization violation"), "{said}");
+    let stderr = String::from_utf8(ran.stderr).unwrap();
+    assert!(ran.status.code() == Some(2) && stderr.contains("authorization violation"), "{stderr}");
     assert!(first.process.is_running());
     let listed = nats.cluster(&["worker", "list"]).unwrap();
-    assert!(listed.contains("revoked") && listed.matches(" good ").count() == 1, "{listed}");
+    assert!(listed.contains("revoked") && listed.matches(" valid ").count() == 1, "{listed}");
     // The hub drops a silent worker after fifteen seconds. Tiles sent to a pool without workers
     // return later.
     until("the disconnected worker is dropped", || async { workers(&app).await.len() == 1 }).await;

@@ -1,4 +1,4 @@
-//! Workers that report what can't be: made by hand, against a real message server and a real `serve`.
+//! Simulated workers that report impossible results to a real message server and a real `serve`.
 
 use std::time::{Duration, Instant};
 
@@ -22,7 +22,7 @@ use crate::samples::Scene;
 const CHUNK: usize = 512 * 1024;
 const HEADER: usize = 32;
 
-/// A server whose tiles leave the machine, with this share of them computed twice.
+/// Starts a server that hands all tiles to other machines, with this share of them computed twice.
 async fn served(nats: &Nats, fraction: &str) -> TestApp {
     let url = nats.url();
     TestApp::with(&[
@@ -50,7 +50,7 @@ async fn program(nats: &Nats) -> Value {
     hello["program"].clone()
 }
 
-/// A worker by hand.
+/// A simulated worker.
 struct Liar {
     client: Client,
     context: Context,
@@ -58,7 +58,7 @@ struct Liar {
     id: String,
 }
 
-/// A tile that it has.
+/// The tile of a simulated worker.
 struct Tile {
     message: Message,
     task: String,
@@ -111,7 +111,7 @@ impl Liar {
     async fn take(&self) -> Tile {
         let start = Instant::now();
         loop {
-            assert!(start.elapsed() < Duration::from_secs(60), "there is no tile");
+            assert!(start.elapsed() < Duration::from_secs(60), "no tile arrives");
             self.beat().await;
             let Some(message) = self.pull().await else { continue };
             let body: Value = serde_json::from_slice(&message.payload).unwrap();
@@ -248,7 +248,7 @@ impl Tile {
     }
 }
 
-/// Frames and end of a tile, and the reason for which they are to be rejected.
+/// Frames and end of a tile, and the expected reason of the rejection.
 type Lie = (&'static str, Box<dyn Fn(&Tile) -> Vec<u8>>, Box<dyn Fn(&mut Value)>);
 
 fn lies() -> Vec<Lie> {
@@ -284,7 +284,7 @@ fn lies() -> Vec<Lie> {
             bytes.extend(bytes[HEADER..].to_vec());
             bytes
         }),
-        // As many bytes of another shape.
+        // The frames have the right number of bytes and a wrong shape.
         frames("the frames are 8 frames of 12x24 pixels", |tile| {
             let mut bytes = tile.plausible();
             bytes[12..16].copy_from_slice(&8u32.to_le_bytes());
@@ -314,14 +314,14 @@ fn lies() -> Vec<Lie> {
 }
 
 #[tokio::test]
-async fn results_that_can_not_be_cost_an_attempt_each() {
+async fn impossible_results_cost_an_attempt_each() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
     let program = program(&nats).await;
     let app = served(&nats, "0").await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let lies = lies();
-    // A job gives up a tile after three failures: few lies to each, and then a worker that does its work.
+    // A job fails after three failures of a tile. Each job therefore gets a few lies, then the real frames.
     for (n, some) in lies.chunks(8).enumerate() {
         let liar = Liar::enter(&nats, "test", &program).await;
         let id = app.submit(&job(&measurement)).await;
@@ -332,11 +332,11 @@ async fn results_that_can_not_be_cost_an_attempt_each() {
             let mut end = tile.done(&frames, put);
             change(&mut end);
             liar.report(&tile, end).await;
-            let found = tile.reason(&app).await;
-            assert!(found.contains(reason), "{reason}: {found}");
-            eprintln!("{found}");
+            let actual = tile.reason(&app).await;
+            assert!(actual.contains(reason), "{reason}: {actual}");
+            eprintln!("{actual}");
         }
-        // A first chunk that is too short, and one that is too long.
+        // The first chunk is too short, or too long.
         for length in [100, 100_000].into_iter().skip(n) {
             let tile = liar.take().await;
             let frames = tile.plausible();
@@ -361,7 +361,7 @@ async fn results_that_can_not_be_cost_an_attempt_each() {
 }
 
 #[tokio::test]
-async fn a_result_is_taken_of_the_worker_that_began_and_its_residual_is_the_servers() {
+async fn only_the_owner_may_report_and_the_server_computes_the_residual() {
     let Some(nats) = Nats::start(1) else { return };
     let program = program(&nats).await;
     let app = served(&nats, "0").await;
@@ -381,13 +381,12 @@ async fn a_result_is_taken_of_the_worker_that_began_and_its_residual_is_the_serv
         "seq": tile.seq, "delivery": tile.delivery, "end": done});
     let failed = json!({"task": tile.task, "attempt": tile.attempt, "worker": second.id,
         "end": {"failed": {"reason": "forged", "retry": false}}});
-    let of_no_attempt =
-        json!({"task": tile.task, "attempt": u32::MAX, "worker": first.id, "end": done});
+    let stray = json!({"task": tile.task, "attempt": u32::MAX, "worker": first.id, "end": done});
     let deep = "[".repeat(100_000);
     let events: Vec<String> = junk
         .into_iter()
         .chain([deep])
-        .chain([unknown, forged, failed, of_no_attempt].map(|event| event.to_string()))
+        .chain([unknown, forged, failed, stray].map(|event| event.to_string()))
         .collect();
     for event in &events {
         second.send(event.clone()).await;
@@ -396,13 +395,13 @@ async fn a_result_is_taken_of_the_worker_that_began_and_its_residual_is_the_serv
         figure(&app, "sci_recon_cluster_refused_total").await == events.len() as f64
     })
     .await;
-    // A beat for it is not the other's, either.
+    // A beat of the other worker about the tile is refused too.
     let beat = json!({"worker": second.id, "leaves": false, "tile": {"task": tile.task,
         "attempt": tile.attempt, "history": null,
         "progress": {"stage": "tv", "iterations": 77, "passes": 0, "fraction": 0.9}}});
     second.client.publish("sci.v1.beat.test", beat.to_string().into()).await.unwrap();
     second.client.flush().await.unwrap();
-    // Rounding in the statement is not seen in the manifest.
+    // The manifest has the residual that the server computes, not the stated one.
     let put = first.put_frames(&tile, &frames).await;
     let mut end = tile.done(&frames, put);
     let exact = residual(&tile.masks, &frames, &tile.snapshot);
@@ -432,7 +431,7 @@ async fn a_huge_answer_leaves_the_server_alive_and_small() {
     let tile = liar.take().await;
     let frames = tile.plausible();
     let before = app.peak_memory();
-    // Each chunk is there, and the hash is right.
+    // All chunks exist, and the hash is right.
     let (chunk, count) = (vec![0x5a; CHUNK], 400);
     let mut hasher = Sha256::new();
     for n in 0..count {
@@ -449,7 +448,7 @@ async fn a_huge_answer_leaves_the_server_alive_and_small() {
 }
 
 #[tokio::test]
-async fn missing_frames_of_one_pool_hold_up_no_other() {
+async fn missing_frames_of_one_pool_delay_no_other_pool() {
     let Some(nats) = Nats::start(1) else { return };
     let program = program(&nats).await;
     let app = served(&nats, "0").await;
@@ -484,7 +483,11 @@ async fn missing_frames_of_one_pool_hold_up_no_other() {
 }
 
 /// The residual of each tile, and the hash of each file.
-async fn found(app: &TestApp, body: &Value, snapshots: usize) -> (Vec<Value>, Value) {
+async fn residuals_and_hashes(
+    app: &TestApp,
+    body: &Value,
+    snapshots: usize,
+) -> (Vec<Value>, Value) {
     let id = app.submit(body).await;
     let done = app.ended(&id).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
@@ -515,17 +518,26 @@ async fn runs_with_cuts_and_mosaics_are_accepted_with_the_same_residuals() {
     let mut colours = with_iterations(&measurement, 30);
     colours["schedule"]["method"] = json!("admm");
     colours["snapshots"] = json!(0);
-    let expected = [found(&app, &sequence, 7).await, found(&app, &colours, 1).await];
+    let expected = [
+        residuals_and_hashes(&app, &sequence, 7).await,
+        residuals_and_hashes(&app, &colours, 1).await,
+    ];
     let url = nats.url();
     let line = ["--workers", "0", "--nats", &url, "--verify-fraction", "0"];
     let app = app.again(&line).await;
     let _workers = [worker(&nats, &[]), worker(&nats, &[])];
-    assert_eq!([found(&app, &sequence, 7).await, found(&app, &colours, 1).await], expected);
+    assert_eq!(
+        [
+            residuals_and_hashes(&app, &sequence, 7).await,
+            residuals_and_hashes(&app, &colours, 1).await
+        ],
+        expected
+    );
     assert_eq!(figure(&app, "sci_recon_cluster_rejected_total").await, 0.0);
 }
 
 #[tokio::test]
-async fn two_workers_that_agree_are_believed() {
+async fn a_result_is_accepted_if_two_workers_agree() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
     let app = served(&nats, "1").await;
@@ -546,7 +558,7 @@ async fn two_workers_that_agree_are_believed() {
 }
 
 #[tokio::test]
-async fn plausible_frames_that_are_wrong_are_found_by_a_second_worker() {
+async fn a_second_worker_detects_plausible_wrong_frames() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
     let program = program(&nats).await;
@@ -555,7 +567,7 @@ async fn plausible_frames_that_are_wrong_are_found_by_a_second_worker() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let id = app.submit(&job(&measurement)).await;
     let tile = liar.take().await;
-    // The honest worker is there before the result.
+    // The honest worker joins before the result arrives.
     let url = nats.url();
     let _worker = RemoteWorker::start(&["--nats", &url, "--pool", "test"]);
     until("it has come", || async { super::workers(&app).await.len() == 2 }).await;

@@ -145,14 +145,14 @@ async fn a_server_connects_when_the_message_server_appears() {
 async fn an_invalid_address_or_credential_stops_the_server() {
     let serve = |line: &[&str]| {
         let folder = tempfile::tempdir().unwrap();
-        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        let mut command = crate::app::bounded_program();
         let data = folder.path().join("data");
         let ran = command.args(["serve", "--data"]).arg(data).args(line).output().unwrap();
         assert!(!ran.status.success());
         String::from_utf8(ran.stderr).unwrap()
     };
     let report = serve(&["--listen", "127.0.0.1:0", "--nats", "nowhere at all"]);
-    assert!(report.contains("is no address of a NATS server"), "{report}");
+    assert!(report.contains("is not an address of a NATS server"), "{report}");
     let report = serve(&["--listen", "127.0.0.1:0", "--nats-creds", "/nowhere/hub.creds"]);
     assert!(report.contains("hub.creds"), "{report}");
 }

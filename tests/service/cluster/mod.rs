@@ -23,7 +23,7 @@ use crate::app::TestApp;
 use crate::faults::results;
 use crate::samples::Scene;
 
-/// Sixteen tiles that take a fraction of a second each.
+/// A job with sixteen tiles, which take a fraction of a second each.
 fn job(measurement: &str) -> Value {
     with_iterations(measurement, 700)
 }
@@ -76,8 +76,8 @@ async fn figure(app: &TestApp, name: &str) -> f64 {
 /// The remote workers that the server knows.
 async fn workers(app: &TestApp) -> Vec<Value> {
     let system = app.get("/v1/system").await.expect(200).json();
-    let all = system["workers"].as_array().unwrap().clone();
-    all.into_iter().filter(|worker| !worker["pool"].is_null()).collect()
+    let listed = system["workers"].as_array().unwrap().clone();
+    listed.into_iter().filter(|worker| !worker["pool"].is_null()).collect()
 }
 
 /// Waits until a condition holds.
@@ -106,13 +106,17 @@ async fn a_job_on_remote_workers_gives_the_same_bytes() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let id = app.submit(&job(&measurement)).await;
     busy(&app).await;
-    let found = workers(&app).await;
-    assert_eq!(found.len(), 2, "{found:#?}");
-    let one = found.iter().find(|worker| !worker["task"].is_null()).unwrap();
-    assert_eq!((&one["pool"], &one["device"]), (&json!("test"), &json!("cpu")), "{one:#}");
-    assert!(!one["host"].as_str().unwrap().is_empty(), "{one:#}");
-    assert_eq!(one["task"]["kind"], "tile");
-    assert_eq!(one["task"]["job"], id);
+    let known = workers(&app).await;
+    assert_eq!(known.len(), 2, "{known:#?}");
+    let busy_worker = known.iter().find(|worker| !worker["task"].is_null()).unwrap();
+    assert_eq!(
+        (&busy_worker["pool"], &busy_worker["device"]),
+        (&json!("test"), &json!("cpu")),
+        "{busy_worker:#}"
+    );
+    assert!(!busy_worker["host"].as_str().unwrap().is_empty(), "{busy_worker:#}");
+    assert_eq!(busy_worker["task"]["kind"], "tile");
+    assert_eq!(busy_worker["task"]["job"], id);
     let done = app.ended(&id).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
     assert_eq!(results(&app, &id).await, *expected);
@@ -125,9 +129,9 @@ async fn a_job_on_remote_workers_gives_the_same_bytes() {
 }
 
 #[tokio::test]
-async fn settings_of_one_process_are_not_taken_for_those_of_another() {
+async fn each_process_uses_only_the_settings_for_it() {
     let Some(nats) = Nats::start(1) else { return };
-    // The server's address of NATS is in its environment, and its own workers do the tiles.
+    // The server's environment has the address of NATS. Its local workers ignore it, and compute the tiles.
     let environment = [("SCI_RECON_NATS", nats.url())];
     let environment = environment.each_ref().map(|(name, url)| (*name, url.as_str()));
     let app = TestApp::in_environment(&["--workers", "1", "--ack-wait", "5"], &environment).await;
@@ -136,7 +140,7 @@ async fn settings_of_one_process_are_not_taken_for_those_of_another() {
     let done = app.ended(&id).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
     drop(app);
-    // A configuration file names a data folder for all commands: a worker elsewhere has none.
+    // A configuration file names a data folder for all commands. A worker on another machine ignores it.
     let app = served(&nats, "5").await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("sci.toml");
@@ -150,16 +154,16 @@ async fn settings_of_one_process_are_not_taken_for_those_of_another() {
 }
 
 #[tokio::test]
-async fn a_worker_keeps_a_lower_priority_than_its_own() {
+async fn a_worker_keeps_a_priority_that_is_lower_than_the_setting() {
     let Some(nats) = Nats::start(1) else { return };
     let app = served(&nats, "5").await;
     let url = nats.url();
     let line = ["--nats", url.as_str(), "--pool", "test"];
-    // Somebody other than root may not raise it. What `nice` adds, it adds to that of the test.
-    let own = rustix::process::getpriority_process(None).unwrap();
+    // Only root may raise a priority. `nice` adds to the value of the test.
+    let own_priority = rustix::process::getpriority_process(None).unwrap();
     for added in [15, 5] {
         let started = added.to_string();
-        let expected = (own + added).clamp(10, 19).to_string();
+        let expected = (own_priority + added).clamp(10, 19).to_string();
         let mut worker = RemoteWorker::within(&["nice", "-n", &started], &line);
         until("the worker comes in", || async { workers(&app).await.len() == 1 }).await;
         let stat = format!("/proc/{}/stat", worker.inner().unwrap().as_raw_nonzero());
@@ -168,12 +172,12 @@ async fn a_worker_keeps_a_lower_priority_than_its_own() {
         assert_eq!(fields.split(' ').nth(16), Some(&*expected), "{stat}");
         worker.process.signal(Signal::TERM);
         assert_eq!(worker.process.ended(Duration::from_secs(5)), Some(0));
-        until("the worker is gone", || async { workers(&app).await.is_empty() }).await;
+        until("the worker has ended", || async { workers(&app).await.is_empty() }).await;
     }
 }
 
 #[tokio::test]
-async fn a_worker_that_is_killed_in_a_tile_costs_one_attempt() {
+async fn a_worker_that_is_killed_during_a_tile_costs_one_attempt() {
     let Some(nats) = Nats::start(1) else { return };
     let expected = local().await;
     let app = served(&nats, "2").await;
@@ -203,7 +207,7 @@ async fn a_stopping_worker_returns_its_tile() {
     assert_eq!(first.process.ended(Duration::from_secs(5)), Some(0));
     eprintln!("the worker ended after {:?}", start.elapsed());
     until("the worker is removed from the list", || async { workers(&app).await.is_empty() }).await;
-    // The tile is back long before its message would be redelivered.
+    // The tile returns long before its message would be redelivered.
     let _second = worker(&nats, &[]);
     busy(&app).await;
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
@@ -271,16 +275,16 @@ async fn a_worker_of_another_version_is_rejected_with_both_versions() {
         String::from_utf8(answer.unwrap().payload.to_vec()).unwrap()
     };
     assert!(refused.contains("0.0.7") && refused.contains(env!("CARGO_PKG_VERSION")), "{refused}");
-    // The waiting worker is accepted ...
+    // The waiting worker is accepted.
     until("the worker is accepted", || async { workers(&app).await.len() == 1 }).await;
     assert!(waiting.process.is_running());
     drop(app);
-    // ... and a rejected one ends with the reason.
+    // A rejected worker ends with the reason.
     let mut hellos = client.subscribe("sci.v1.hello.other").await.unwrap();
     let url = nats.url();
     let mut unwelcome = RemoteWorker::start(&["--nats", &url, "--pool", "other"]);
-    let asked = futures_util::StreamExt::next(&mut hellos).await.unwrap();
-    client.publish(asked.reply.unwrap(), refused.into()).await.unwrap();
+    let greeting = futures_util::StreamExt::next(&mut hellos).await.unwrap();
+    client.publish(greeting.reply.unwrap(), refused.into()).await.unwrap();
     client.flush().await.unwrap();
     assert_eq!(unwelcome.process.ended(Duration::from_secs(10)), Some(2));
     assert!(unwelcome.log().contains("0.0.7"), "{}", unwelcome.log());
@@ -313,9 +317,9 @@ async fn a_tile_that_kills_its_workers_is_abandoned() {
     let Some(nats) = Nats::start(1) else { return };
     let folder = tempfile::tempdir().unwrap();
     let library = crate::hangs::library(folder.path(), "abort();");
-    // The worker runs as somebody else.
+    // The worker runs as another user.
     std::fs::set_permissions(folder.path(), std::fs::Permissions::from_mode(0o755)).unwrap();
-    // Far longer than the test, so no tile is redelivered because of silence.
+    // The time is far longer than the test, so silence redelivers no tile.
     let app = served(&nats, "600").await;
     let mut worker = worker(&nats, &["--onnxruntime", library.to_str().unwrap()]);
     let (_, measurement) = app.scene(&Scene::SMALL).await;

@@ -195,34 +195,34 @@ async fn the_documented_commands_work_between_two_machines() {
     shell.current_dir(other.path()).stderr(log.try_clone().unwrap()).stdout(log);
     machines.started.push(shell.spawn().unwrap());
     let heard = || std::fs::read_to_string(other.path().join("log")).unwrap() + &server_log();
-    let there = || {
+    let has_joined = || {
         let system = machines.api("/v1/system", None);
         system["workers"].as_array().unwrap().iter().any(|worker| worker["pool"] == "default")
     };
-    wait("the worker is connected", there, &heard);
+    wait("the worker is connected", has_joined, &heard);
 
-    // A job that gives the same frames as on one machine.
+    // The job must give the same frames as on one machine.
     let masks = machines.upload(&Scene::SMALL.masks());
     let calibration = machines.api("/v1/calibrations", Some(&json!({"masks": masks})));
     let data = machines.upload(&Scene::SMALL.snapshots());
     let body = json!({"calibration": calibration["id"], "data": data});
     let measurement = machines.api("/v1/measurements", Some(&body));
-    let made = machines.api("/v1/jobs", Some(&job(measurement["id"].as_str().unwrap())));
-    let path = format!("/v1/jobs/{}", made["id"].as_str().unwrap());
+    let created = machines.api("/v1/jobs", Some(&job(measurement["id"].as_str().unwrap())));
+    let path = format!("/v1/jobs/{}", created["id"].as_str().unwrap());
     wait("the job ends", || machines.api(&path, None)["finished_at"].is_string(), &heard);
     let done = machines.api(&path, None);
     assert_eq!(done["state"], "succeeded", "{done:#}\n{}", heard());
-    let mut found = std::collections::BTreeMap::new();
+    let mut hashes = std::collections::BTreeMap::new();
     for snapshot in 0..Scene::SMALL.snapshots {
         let listed = machines.api(&format!("{path}/snapshots/{snapshot}"), None);
         for file in listed["files"].as_array().unwrap() {
             let text = |field: &str| file[field].as_str().unwrap().to_owned();
             if text("name") != "manifest.json" {
-                found.insert(format!("{snapshot}/{}", text("name")), text("sha256"));
+                hashes.insert(format!("{snapshot}/{}", text("name")), text("sha256"));
             }
         }
     }
-    assert_eq!(found, *expected);
+    assert_eq!(hashes, *expected);
 }
 
 fn wait(what: &str, mut holds: impl FnMut() -> bool, log: &impl Fn() -> String) {

@@ -21,15 +21,15 @@ fn ports(count: usize) -> Vec<u16> {
     open.iter().map(|listener| listener.local_addr().unwrap().port()).collect()
 }
 
-/// Path of nats-server: `NATS_SERVER`, or the installed one; none after [`skip`].
+/// Path of nats-server: `NATS_SERVER`, or the installed one. Calls [`skip`] if there is none.
 pub fn server() -> Option<PathBuf> {
     let named = std::env::var_os("NATS_SERVER").map(PathBuf::from);
     let places = ["/usr/sbin/nats-server", "/usr/local/bin/nats-server", "/usr/bin/nats-server"];
-    let found = named.or_else(|| places.map(PathBuf::from).into_iter().find(|path| path.exists()));
-    if found.is_none() {
+    let path = named.or_else(|| places.map(PathBuf::from).into_iter().find(|path| path.exists()));
+    if path.is_none() {
         skip("nats-server is not installed: run `apt-get install nats-server`, or set NATS_SERVER");
     }
-    found
+    path
 }
 
 /// A process that is killed when this is dropped.
@@ -97,8 +97,8 @@ impl Nats {
     pub fn start(count: usize) -> Option<Self> {
         let program = server()?;
         let folder = tempfile::tempdir().unwrap();
-        let all = ports(2 * count);
-        let (ports, routes) = all.split_at(count);
+        let all_ports = ports(2 * count);
+        let (ports, routes) = all_ports.split_at(count);
         for n in 0..count {
             let store = folder.path().join(format!("store{n}"));
             let mut text = format!(
@@ -144,13 +144,13 @@ impl Nats {
             }
         }
         line.extend(more.iter().map(|&word| word.to_owned()));
-        let made = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+        let output = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
             .args(line)
             .env("NATS_SERVER", &program)
             .output()
             .unwrap();
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-        let listing = String::from_utf8(made.stdout).unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let listing = String::from_utf8(output.stdout).unwrap();
         let lines = listing.lines().filter_map(|line| line.strip_prefix("nats-server -c "));
         let configurations: Vec<PathBuf> = lines.map(PathBuf::from).collect();
         assert_eq!(configurations.len(), count, "{listing}");
@@ -306,8 +306,8 @@ impl Nats {
         use futures_util::TryStreamExt;
         let context = async_nats::jetstream::new(self.client().await);
         loop {
-            let found = context.get_stream(stream).await.unwrap();
-            let subjects = found.info_with_subjects(">").await.unwrap();
+            let handle = context.get_stream(stream).await.unwrap();
+            let subjects = handle.info_with_subjects(">").await.unwrap();
             let subjects: Vec<(String, usize)> = subjects.try_collect().await.unwrap();
             if let Some((subject, _)) = subjects.into_iter().next() {
                 return subject;
@@ -319,14 +319,14 @@ impl Nats {
     /// Number of messages in each stream.
     pub async fn messages(&self) -> Vec<(String, u64)> {
         let context = async_nats::jetstream::new(self.client().await);
-        let mut found = Vec::new();
+        let mut counts = Vec::new();
         for name in ["SCI_TASKS", "SCI_EVENTS", "SCI_IN", "SCI_OUT"] {
             // A cluster may be electing a leader.
             let stream = context.get_stream(name).await;
             let count = stream.map_or(1, |stream| stream.cached_info().state.messages);
-            found.push((name.to_owned(), count));
+            counts.push((name.to_owned(), count));
         }
-        found
+        counts
     }
 
     /// State of the streams of tiles and events and of their consumers.
@@ -363,7 +363,7 @@ impl Nats {
     }
 }
 
-/// The program, in a place where other users may run it.
+/// A copy of the program that other users may run.
 pub fn program() -> &'static Path {
     static COPY: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
     let (_, path) = COPY.get_or_init(|| {
@@ -387,12 +387,13 @@ fn image_environment() -> Vec<(String, String)> {
     let words =
         stage.lines().filter_map(|line| line.strip_prefix("ENV ")).flat_map(str::split_whitespace);
     let pairs = words.map(|word| word.split_once('=').unwrap());
-    let found: Vec<_> = pairs.map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
-    assert!(!found.is_empty(), "the image has no ENV");
-    found
+    let variables: Vec<_> =
+        pairs.map(|(name, value)| (name.to_owned(), value.to_owned())).collect();
+    assert!(!variables.is_empty(), "the image has no ENV");
+    variables
 }
 
-/// A worker in an empty folder, with the environment of a container, as another user where the test is root.
+/// A worker in an empty folder, with the environment of a container. It runs as another user if the test is root.
 pub struct RemoteWorker {
     pub process: Process,
     pub folder: TempDir,
@@ -407,15 +408,19 @@ impl RemoteWorker {
 
     /// Starts a worker with a copy of a credential.
     pub fn with_credential(credential: &Path, arguments: &[&str]) -> Self {
-        let own = tempfile::NamedTempFile::new().unwrap();
-        std::fs::copy(credential, own.path()).unwrap();
+        let own_copy = tempfile::NamedTempFile::new().unwrap();
+        std::fs::copy(credential, own_copy.path()).unwrap();
         if rustix::process::getuid().is_root() {
-            std::os::unix::fs::chown(own.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID))
-                .unwrap();
+            std::os::unix::fs::chown(
+                own_copy.path(),
+                Some(UNPRIVILEGED_UID),
+                Some(UNPRIVILEGED_UID),
+            )
+            .unwrap();
         }
-        let path = own.path().to_str().unwrap().to_owned();
+        let path = own_copy.path().to_str().unwrap().to_owned();
         let mut worker = Self::within(&[], &[&["--nats-creds", path.as_str()], arguments].concat());
-        worker.credential = Some(own);
+        worker.credential = Some(own_copy);
         worker
     }
 
@@ -457,8 +462,8 @@ impl RemoteWorker {
         let children = threads
             .iter()
             .filter_map(|thread| std::fs::read_to_string(thread.path().join("children")).ok());
-        let all = children.collect::<Vec<String>>().join(" ");
-        Pid::from_raw(all.split_whitespace().next()?.parse().ok()?)
+        let identifiers = children.collect::<Vec<String>>().join(" ");
+        Pid::from_raw(identifiers.split_whitespace().next()?.parse().ok()?)
     }
 
     /// Kills both processes with SIGKILL, like a failure of the machine.

@@ -170,7 +170,7 @@ impl Ground {
     }
 
     /// Compares the workers' cache and memory with their limits.
-    fn look(&mut self) {
+    fn check_limits(&mut self) {
         for worker in &self.workers {
             let cached = worker.cached();
             assert!(cached <= CACHE, "a cache holds {cached} bytes");
@@ -181,14 +181,14 @@ impl Ground {
     }
 
     /// Reads the metrics of a server before its end.
-    async fn note_figures(&mut self) {
+    async fn record_metrics(&mut self) {
         for name in ["redelivered", "refused", "repaired"] {
             let value = figure(&self.app, &format!("sci_recon_cluster_{name}_total")).await;
             *self.counts.entry(name).or_default() += value;
         }
     }
 
-    async fn bring_about(&mut self, fault: Fault) {
+    async fn inject(&mut self, fault: Fault) {
         let pick = self.random.random_range(0..self.workers.len());
         let nodes = self.nats.nodes.len();
         match fault {
@@ -203,7 +203,7 @@ impl Ground {
                 self.nats.begin(leader);
             }
             Fault::ServerKilled => {
-                self.note_figures().await;
+                self.record_metrics().await;
                 self.app.restart();
             }
             Fault::WorkerSuspended => {
@@ -250,9 +250,9 @@ impl Ground {
                 break;
             }
             eprintln!("{:6.1} s: {fault:?}", start.elapsed().as_secs_f64());
-            self.bring_about(fault).await;
+            self.inject(fault).await;
             *self.counts.entry("faults").or_default() += 1.0;
-            self.look();
+            self.check_limits();
         }
         loop {
             let job = self.app.get(&format!("/v1/jobs/{id}")).await.expect(200).json();
@@ -266,7 +266,7 @@ impl Ground {
                     self.nats.state().await
                 ),
             }
-            self.look();
+            self.check_limits();
             tokio::time::sleep(Duration::from_millis(200)).await;
         }
         id
@@ -308,7 +308,7 @@ pub async fn database(data: &Path) -> sqlx::SqliteConnection {
 }
 
 /// Number of tiles in the database that were not accepted exactly once.
-async fn not_once(data: &Path, job: &str) -> i64 {
+async fn count_not_accepted_once(data: &Path, job: &str) -> i64 {
     use sqlx::Row;
     let mut connection = database(data).await;
     let row = sqlx::query(
@@ -343,11 +343,11 @@ async fn rounds_by(
     for round in 1..=count {
         let job = ground.round(&measurement, faults).await;
         wrong += u32::from(frames(&ground.app, &job).await != expected);
-        twice += not_once(ground.app.data(), &job).await;
+        twice += count_not_accepted_once(ground.app.data(), &job).await;
         ground.nats.emptied().await;
         eprintln!("{name}: round {round} of {count} after {:?}", start.elapsed());
     }
-    ground.note_figures().await;
+    ground.record_metrics().await;
     let ok = wrong == 0 && twice == 0;
     let line = json!({
         "target": name, "ok": ok, "rounds": count, "nodes": nodes, "delay_ms": delay.as_millis() as u64,

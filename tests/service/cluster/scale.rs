@@ -144,12 +144,13 @@ impl Simulated {
                 let batch = consumer.batch().max_messages(1).expires(Duration::from_secs(5));
                 batch.messages().await.ok()?.next().await?.ok()
             };
-            let found = tokio::time::timeout(Duration::from_secs(6), pulled).await.ok().flatten();
+            let pulled_message =
+                tokio::time::timeout(Duration::from_secs(6), pulled).await.ok().flatten();
             if signed.elapsed() > Duration::from_secs(5) {
                 self.say("beat", idle.clone()).await;
                 signed = Instant::now();
             }
-            let Some(message) = found else { continue };
+            let Some(message) = pulled_message else { continue };
             if self.tile(&message, ack_wait, free).await {
                 free = Some(Instant::now());
                 self.crowd.done.fetch_add(1, Ordering::Relaxed);
@@ -184,8 +185,8 @@ impl Simulated {
         let (mut reported, mut kept) = (start, start);
         let length = *self.crowd.length.lock().unwrap();
         while start.elapsed() < length {
-            let left = length.saturating_sub(start.elapsed());
-            tokio::time::sleep(left.min(Duration::from_millis(500))).await;
+            let remaining = length.saturating_sub(start.elapsed());
+            tokio::time::sleep(remaining.min(Duration::from_millis(500))).await;
             if reported.elapsed() > Duration::from_secs(1) {
                 let tile = json!({"task": task["task"], "attempt": attempt,
                     "progress": self.crowd.end["progress"], "history": null});
@@ -242,7 +243,7 @@ pub fn residual(masks: &[u8], frames: &[u8], snapshot: &[u8]) -> f32 {
     (norm(&rest) / norm(&y)) as f32
 }
 
-/// A scene with at least so many tiles of 24 pixels.
+/// A scene with at least `tiles` tiles of 24 pixels.
 fn scene(tiles: usize) -> Scene {
     let side = (1..).find(|side| side * side >= tiles).unwrap();
     Scene { frames: 2, height: 16 * side + 8, width: 16 * side + 8, snapshots: 1 }
@@ -307,15 +308,15 @@ async fn crowd_of(
     crowd: &Arc<Crowd>,
     (from, to): (usize, usize),
 ) -> Vec<tokio::task::JoinHandle<()>> {
-    let mut all = Vec::new();
+    let mut handles = Vec::new();
     for n in from..to {
-        all.push(tokio::spawn(crowd.clone().enter()));
+        handles.push(tokio::spawn(crowd.clone().enter()));
         if n % 50 == 49 {
             tokio::time::sleep(Duration::from_millis(200)).await;
         }
     }
     until("all workers are connected", || async { super::workers(app).await.len() >= to }).await;
-    all
+    handles
 }
 
 /// Raises the soft limit on open files, because each simulated worker has a connection.
@@ -334,7 +335,7 @@ async fn many_idle_workers_take_small_tiles_in_time() {
     let (workers, tiles) = if rounds().is_some() { (500, 2000) } else { (60, 200) };
     let app = served(&nats, "30").await;
     let crowd = Arc::new(Crowd::learn(&nats, &app).await);
-    let all = crowd_of(&app, &crowd, (0, workers)).await;
+    let handles = crowd_of(&app, &crowd, (0, workers)).await;
     let idle = if rounds().is_some() { 30 } else { 1 };
     let before = handing_over(&app, &nats);
     tokio::time::sleep(Duration::from_secs(idle)).await;
@@ -349,7 +350,7 @@ async fn many_idle_workers_take_small_tiles_in_time() {
     println!("{line}");
     assert!(ok, "{line}");
     crowd.stop.store(true, Ordering::Relaxed);
-    futures_util::future::join_all(all).await;
+    futures_util::future::join_all(handles).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -359,11 +360,11 @@ async fn a_thousand_simulated_workers_show_the_limit() {
     open_many_files();
     let app = served(&nats, "30").await;
     let crowd = Arc::new(Crowd::learn(&nats, &app).await);
-    let (mut all, mut lines, mut there) = (Vec::new(), Vec::new(), 0);
+    let (mut handles, mut lines, mut connected) = (Vec::new(), Vec::new(), 0);
     for workers in [10, 100, 300, 1000] {
-        all.extend(crowd_of(&app, &crowd, (there, workers)).await);
-        there = workers;
-        // Four tiles per worker, of this duration.
+        handles.extend(crowd_of(&app, &crowd, (connected, workers)).await);
+        connected = workers;
+        // Each worker gets four tiles of this duration.
         for length in [10, 2] {
             let plan = (4 * workers, Duration::from_secs(length));
             let line = simulate(&app, &nats, &crowd, workers, plan).await;
@@ -373,7 +374,7 @@ async fn a_thousand_simulated_workers_show_the_limit() {
     }
     println!("{}", json!({"target": "cluster_simulation", "ok": true, "simulated": lines}));
     crowd.stop.store(true, Ordering::Relaxed);
-    futures_util::future::join_all(all).await;
+    futures_util::future::join_all(handles).await;
 }
 
 /// CPU seconds of a worker's computing process and its supervisor.
@@ -384,7 +385,7 @@ fn cpu_of_worker(worker: &RemoteWorker) -> f64 {
 
 /// True if the server's local process computes a job's pilot or preview, which belong to the
 /// solver.
-async fn solves_at_home(records: &mut sqlx::SqliteConnection, job: &str) -> bool {
+async fn solves_locally(records: &mut sqlx::SqliteConnection, job: &str) -> bool {
     let row = sqlx::query(
         "SELECT count(*) AS n FROM tasks
          WHERE job = ? AND kind IN ('pilot', 'preview') AND state = 'running'",
@@ -407,13 +408,13 @@ async fn cost(app: &TestApp, nats: &Nats, workers: &[RemoteWorker], body: &Value
     let job = app.submit(body).await;
     let mut records = database(app.data()).await;
     let (start, mut home) = (Instant::now(), 0.0);
-    for look in 0.. {
+    for poll in 0.. {
         let before = local(app);
         tokio::time::sleep(Duration::from_millis(50)).await;
-        if solves_at_home(&mut records, &job).await {
+        if solves_locally(&mut records, &job).await {
             home += local(app) - before;
         }
-        if look % 10 == 0 {
+        if poll % 10 == 0 {
             let job = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
             if job["state"] == "succeeded" {
                 break;
@@ -447,7 +448,7 @@ async fn little_time_of_a_deep_job_is_spent_outside_the_solver() {
     let after = workers.each_ref().map(cpu_of_worker);
     let idle = after.iter().zip(before).map(|(after, before)| (after - before) / IDLE as f64);
     let idle = idle.fold(0.0, f64::max);
-    // Almost no computation, then the default schedule or one with fewer deep passes.
+    // The first job needs almost no computation. The second has the default schedule or one with fewer deep passes.
     let scene = Scene { frames: 10, height: 1024, width: 1024, snapshots: 1 };
     let (_, measurement) = app.scene(&scene).await;
     let nothing = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
@@ -461,18 +462,18 @@ async fn little_time_of_a_deep_job_is_spent_outside_the_solver() {
     }
     let [base_server, base_nats, base_workers, base_tiles, _] =
         cost(&app, &nats, &workers, &nothing).await;
-    let [server, nats_cpu, all, tiles, home] = cost(&app, &nats, &workers, &deep).await;
-    let whole = server + nats_cpu + all;
+    let [server, nats_cpu, workers_cpu, tiles, home] = cost(&app, &nats, &workers, &deep).await;
+    let total = server + nats_cpu + workers_cpu;
     // Time of the workers outside tiles, and for their inputs.
-    let outside = (server - home) + nats_cpu + (all - tiles) + base_tiles;
-    let share = outside / whole;
+    let outside = (server - home) + nats_cpu + (workers_cpu - tiles) + base_tiles;
+    let share = outside / total;
     let ok = share <= 0.02 && idle < 0.002;
     let round = |value: f64| (value * 1e4).round() / 1e4;
     let line = json!({
         "target": "cluster_overhead", "ok": ok, "idle_worker_cores": round(idle),
         "deep_passes": deep["schedule"]["stages"][1]["iterations"],
-        "job_cpu_seconds": round(whole), "server": round(server), "pilot_and_preview": round(home), "nats": round(nats_cpu),
-        "workers": round(all), "tiles": round(tiles), "share_outside": round(share),
+        "job_cpu_seconds": round(total), "server": round(server), "pilot_and_preview": round(home), "nats": round(nats_cpu),
+        "workers": round(workers_cpu), "tiles": round(tiles), "share_outside": round(share),
         "next_to_nothing": {"server": round(base_server), "nats": round(base_nats),
             "workers": round(base_workers), "tiles": round(base_tiles)},
     });

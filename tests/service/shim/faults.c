@@ -6,6 +6,7 @@
  *                next writes of the process fail with ENOSPC
  * FAULT_TOKEN    a file of one byte; only the process that sets it to 1 has the fault
  * FAULT_FULL     a file; while it exists, all writes fail with ENOSPC
+ * FAULT_READONLY a file; while it exists, all writes fail with EROFS
  * FAULT_SLOW     a file; while it exists, regular files are read at FAULT_RATE bytes per second
  * FAULT_CLOCK    a file of 8 bytes with the offset of the wall clock in seconds
  */
@@ -27,7 +28,7 @@
 static long at = -1;
 static int kind_full, kind_stop, failing;
 static atomic_long count;
-static const char *full, *slow;
+static const char *full, *readonly, *slow;
 static double rate = 1e6;
 static volatile char *token;
 static volatile long long *skew;
@@ -53,6 +54,7 @@ __attribute__((constructor)) static void begin(void) {
         close(file);
     }
     full = getenv("FAULT_FULL");
+    readonly = getenv("FAULT_READONLY");
     slow = getenv("FAULT_SLOW");
     if (getenv("FAULT_RATE")) rate = atof(getenv("FAULT_RATE"));
     kind_full = kind && strcmp(kind, "full") == 0;
@@ -71,20 +73,21 @@ static int regular(int file) {
     return fstat(file, &about) == 0 && S_ISREG(about.st_mode);
 }
 
-/* True if this operation must fail with ENOSPC. */
+/* The error with which this operation must fail, or 0. */
 static int fault(int writes) {
-    if (writes && full && access(full, F_OK) == 0) return 1;
+    if (writes && full && access(full, F_OK) == 0) return ENOSPC;
+    if (writes && readonly && access(readonly, F_OK) == 0) return EROFS;
     if (at < 0) return 0;
     long now = atomic_fetch_add(&count, 1) + 1;
     if (now == at && token && __sync_bool_compare_and_swap(token, 0, 1)) {
         if (!kind_full) kill(getpid(), kind_stop ? SIGSTOP : SIGKILL);
         failing = kind_full;
     }
-    return failing && now < at + 8 && writes;
+    return failing && now < at + 8 && writes ? ENOSPC : 0;
 }
 
 #define REAL(name) __typeof__(&name) real = (__typeof__(&name))dlsym(RTLD_NEXT, #name)
-#define FAIL do { errno = ENOSPC; return -1; } while (0)
+#define FAIL_IF(error) do { int number = (error); if (number) { errno = number; return -1; } } while (0)
 
 ssize_t read(int file, void *bytes, size_t size) {
     REAL(read);
@@ -98,12 +101,12 @@ ssize_t read(int file, void *bytes, size_t size) {
 }
 ssize_t write(int file, const void *bytes, size_t size) {
     REAL(write);
-    if (regular(file) && fault(1)) FAIL;
+    FAIL_IF(regular(file) ? fault(1) : 0);
     return real(file, bytes, size);
 }
 ssize_t pwrite64(int file, const void *bytes, size_t size, off64_t offset) {
     REAL(pwrite64);
-    if (regular(file) && fault(1)) FAIL;
+    FAIL_IF(regular(file) ? fault(1) : 0);
     return real(file, bytes, size, offset);
 }
 ssize_t pwrite(int file, const void *bytes, size_t size, off_t offset) {
@@ -111,32 +114,32 @@ ssize_t pwrite(int file, const void *bytes, size_t size, off_t offset) {
 }
 int fsync(int file) {
     REAL(fsync);
-    if (fault(1)) FAIL;
+    FAIL_IF(fault(1));
     return real(file);
 }
 int fdatasync(int file) {
     REAL(fdatasync);
-    if (fault(1)) FAIL;
+    FAIL_IF(fault(1));
     return real(file);
 }
 int rename(const char *from, const char *to) {
     REAL(rename);
-    if (fault(1)) FAIL;
+    FAIL_IF(fault(1));
     return real(from, to);
 }
 int mkdir(const char *path, mode_t mode) {
     REAL(mkdir);
-    if (fault(1)) FAIL;
+    FAIL_IF(fault(1));
     return real(path, mode);
 }
 int link(const char *from, const char *to) {
     REAL(link);
-    if (fault(1)) FAIL;
+    FAIL_IF(fault(1));
     return real(from, to);
 }
 int linkat(int from_folder, const char *from, int to_folder, const char *to, int flags) {
     REAL(linkat);
-    if (fault(1)) FAIL;
+    FAIL_IF(fault(1));
     return real(from_folder, from, to_folder, to, flags);
 }
 int unlink(const char *path) {

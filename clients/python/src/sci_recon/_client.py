@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import html
+import io
 import os
 import time
 import uuid
@@ -261,6 +264,10 @@ class Client:
             ),
         )
 
+    def calibration(self, identifier: str) -> Calibration:
+        """A calibration that was made before, by this client or another."""
+        return Calibration(self, self._get(f"/v1/calibrations/{identifier}"))
+
     def job(self, identifier: str) -> Job:
         """A job that was submitted before, by this client or another."""
         return Job(self, self._get(f"/v1/jobs/{identifier}"))
@@ -342,6 +349,22 @@ class Calibration(Entity):
         """Waits until there are masks."""
         self._ready("calibrations")
         return self
+
+    def masks(self) -> npt.NDArray[np.float32]:
+        """The masks [B, H, W] on [0, 1], from the uploaded file. `ValueError` unless that is an npy file."""
+        record, name = self.record, self.record["masks"]
+        with TemporaryDirectory(prefix="sci-recon-") as folder:
+            path = Path(folder) / "masks.npy"
+            with self.client._bar("download masks") as bar:
+                transfer.download(self.client.http, f"/v1/blobs/{name}/content", path, name, bar)
+            with path.open("rb") as file:
+                if file.read(6) != b"\x93NUMPY":
+                    raise ValueError(f"the masks are a {record['format']} file; read it, and pass the array")
+            stored = np.load(path)
+        order = (record["axes"] or "frame-row-column").split("-")
+        stored = stored.transpose([order.index(axis) for axis in ("frame", "row", "column")])
+        masks: npt.NDArray[np.float32] = np.maximum(stored / np.float64(record["full_scale"]), 0).astype(np.float32)
+        return masks
 
     def report(self) -> Record:
         """What is known of the masks: a grade, findings, and what to do."""
@@ -441,6 +464,15 @@ class Result:
         name = self.job.record.get("label") or self.job.id
         return f"<Result {name!r}: {self.job.verdict}; {frames} frames of {shape['height']}x{shape['width']}>"
 
+    def _repr_html_(self) -> str:
+        """What Jupyter shows: name, verdict, and an animated preview if Pillow is installed."""
+        text = f"<p>{html.escape(repr(self))}</p>"
+        try:
+            picture = preview(self.snapshot(self.snapshots[0]))
+        except ImportError:
+            return text
+        return f'{text}<img alt="frames" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
+
     @property
     def snapshots(self) -> range:
         """The snapshots of the measurement that were reconstructed."""
@@ -515,6 +547,27 @@ def describe(finding: Record) -> str:
     place = f"snapshot {finding['snapshot']}: " if finding.get("snapshot") is not None else ""
     detail, remedy = finding["detail"].rstrip("."), finding["remedy"].rstrip(".")
     return f"{finding['severity']} {finding['code']}: {place}{detail}. Remedy: {remedy}."
+
+
+def preview(frames: npt.NDArray[np.float32], side: int = 256) -> bytes:
+    """An animated PNG of frames [B, H, W] or [B, H, W, 3], ten a second, from 0 to the white level. Its sides have at most
+    about `side` pixels."""
+    from PIL import Image
+
+    step = max(1, round(max(frames.shape[1:3]) / side))
+    small, white = frames[:, ::step, ::step], white_level(frames)
+    pictures = [Image.fromarray(np.uint8(np.clip(frame / white, 0, 1) * 255)) for frame in small]
+    file = io.BytesIO()
+    pictures[0].save(file, "PNG", save_all=True, append_images=pictures[1:], duration=100, loop=0)
+    return file.getvalue()
+
+
+def white_level(frames: npt.NDArray[np.float32]) -> float:
+    """The 99.9th percentile of frames [B, H, W] or [B, H, W, 3]; 1 for black frames. It uses every n-th pixel of large
+    frames."""
+    step = max(1, int((frames.size / 4e6) ** 0.5))
+    level = float(np.percentile(frames[:, ::step, ::step], 99.9))
+    return level if level > 0 else 1.0
 
 
 class Bar:

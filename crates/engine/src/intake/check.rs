@@ -25,7 +25,7 @@ const WINDOWS: usize = 4;
 /// Number of checked snapshots of a measurement.
 const SNAPSHOTS: usize = 8;
 
-/// How a measurement was recorded.
+/// The conditions of a measurement's exposure.
 #[derive(Debug, Default)]
 pub struct Exposure {
     /// Dark frames, which are averaged and subtracted.
@@ -190,15 +190,15 @@ fn study(
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
     let ((row, column), step) = mosaic.map_or(((0, 0), 1), |mosaic| (mosaic.green(), 2));
     // Sensor pixels of a window of the sub-image.
-    let place = |window: &Range<usize>, first: usize| {
+    let sensor_pixels = |window: &Range<usize>, first: usize| {
         first + window.start * step..first + (window.end * step + 1).saturating_sub(step)
     };
     let mut study = MeasurementStudy::new(frames);
     for rows in windows(height / step) {
         for columns in windows(width / step) {
-            let place = (place(&rows, row), place(&columns, column));
-            let band = masks.read_lattice(0..frames, place.clone(), step)?;
-            let y = snapshots.read_lattice(snapshot..snapshot + 1, place, step)?;
+            let sensor_pixels = (sensor_pixels(&rows, row), sensor_pixels(&columns, column));
+            let band = masks.read_lattice(0..frames, sensor_pixels.clone(), step)?;
+            let y = snapshots.read_lattice(snapshot..snapshot + 1, sensor_pixels, step)?;
             study.add(band.view(), y.index_axis(ndarray::Axis(0), 0));
         }
     }

@@ -1,4 +1,4 @@
-//! Why an upload is refused, in the terms of the answer to its request.
+//! Refusals of uploads, as the answers to requests report them.
 
 use std::io::ErrorKind;
 
@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use strum::IntoStaticStr;
 
 use super::IntakeError;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 
-/// Codes of refusals, a part of those in the contract of the HTTP interface.
+/// Codes of refusals, a subset of the codes of the HTTP interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
@@ -21,16 +21,16 @@ pub enum RefusalCode {
     InsufficientStorage,
     TimedOut,
     Unavailable,
-    /// The service failed, not the upload.
+    /// The service has failed; the upload may be valid.
     Internal,
 }
 
-/// Why nothing is made of an upload.
+/// The reason why an upload is refused.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Refusal {
     pub code: RefusalCode,
     pub detail: String,
-    /// JSON pointer to the field that is to blame.
+    /// JSON pointer to the invalid field.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pointer: Option<String>,
     /// Code of the defect of a file.
@@ -43,7 +43,7 @@ impl Refusal {
         Self { code, detail: detail.into(), pointer: None, reason: None }
     }
 
-    /// Adds the field that is to blame.
+    /// Adds the pointer to the invalid field.
     pub fn at(self, pointer: &str) -> Self {
         Self { pointer: Some(pointer.to_owned()), ..self }
     }
@@ -55,8 +55,17 @@ impl Refusal {
         Self::new(RefusalCode::TimedOut, detail)
     }
 
-    pub fn disk_full() -> Self {
-        Self::new(RefusalCode::InsufficientStorage, "the disk of the service is full")
+    /// The refusal of a file that can't be stored in this state of the disk.
+    pub fn disk_trouble(trouble: DiskTrouble) -> Self {
+        match trouble {
+            DiskTrouble::Full => {
+                Self::new(RefusalCode::InsufficientStorage, "the disk of the service is full")
+            }
+            DiskTrouble::ReadOnly => Self::new(
+                RefusalCode::Unavailable,
+                "the disk of the service is read-only; try again later",
+            ),
+        }
     }
 }
 
@@ -65,8 +74,8 @@ impl TryFrom<FormatError> for Refusal {
     type Error = FormatError;
 
     fn try_from(error: FormatError) -> Result<Self, FormatError> {
-        if error.is_disk_full() {
-            return Ok(Self::disk_full());
+        if let Some(trouble) = error.disk_trouble() {
+            return Ok(Self::disk_trouble(trouble));
         }
         if matches!(&error, FormatError::Io { source, .. } if source.kind() == ErrorKind::TimedOut)
         {

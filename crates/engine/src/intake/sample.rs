@@ -53,11 +53,11 @@ pub fn sample(folder: &Path) -> Result<Sample> {
     let failed = |error: &dyn std::fmt::Display| IntakeError::content("sample", error);
     let (masks, _) = random_squares(count, height, width, SEED).map_err(|error| failed(&error))?;
     let y = measure(masks.view(), frames.view()).map_err(|error| failed(&error))?;
-    let place = |name: &str| folder.join(name);
+    let path = |name: &str| folder.join(name);
     let sample = Sample {
-        masks: place("masks.npy"),
-        measurement: place("measurement.npy"),
-        truth: place("truth.npy"),
+        masks: path("masks.npy"),
+        measurement: path("measurement.npy"),
+        truth: path("truth.npy"),
         frames,
     };
     npy::write_f32(&sample.masks, masks.view())?;

@@ -64,7 +64,7 @@ macro_rules! things {
 things!(CalibrationId, MeasurementId, ModelId, JobId);
 
 identifiers! {
-    /// A calibration, measurement, model or job that a task makes, or makes something of.
+    /// The calibration, measurement, model or job that a task creates, or for which it creates something.
     ThingId,
     /// A calibration: the masks of one optical setting.
     CalibrationId,

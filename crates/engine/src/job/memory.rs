@@ -46,8 +46,9 @@ impl JobSpec {
         // A preview by blocks takes much less than a tile.
         let (height, width) = self.shape.solved();
         let voxels = height * width * self.shape.frames;
-        let whole = if voxels <= preview::WHOLE { voxels as u64 } else { 0 };
-        let preview = whole * (SOLVER_BYTES_PER_VOXEL + self.if_mosaic(COARSE_BYTES_PER_VOXEL));
+        let whole_voxels = if voxels <= preview::WHOLE { voxels as u64 } else { 0 };
+        let preview =
+            whole_voxels * (SOLVER_BYTES_PER_VOXEL + self.if_mosaic(COARSE_BYTES_PER_VOXEL));
         let pixels = (self.shape.height * self.shape.width) as u64;
         let colours = pixels * self.if_mosaic(COLOUR_BYTES_PER_PIXEL);
         let movie = MOVIE_BYTES + self.movie_samples() * MOVIE_BYTES_PER_SAMPLE;

@@ -112,7 +112,7 @@ pub struct JobSpec {
     pub snapshots: SnapshotRange,
     /// Temporal relation of the snapshots.
     pub sequence: Sequence,
-    /// How contiguous snapshots are reconstructed together.
+    /// The runs of contiguous snapshots that are reconstructed together.
     pub run: RunSpec,
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`]; `None` for other algorithms.
@@ -264,7 +264,7 @@ impl JobSpec {
         self.run.plan(first as usize..first as usize + count as usize)
     }
 
-    /// Number of computed snapshots. Those that two runs share count twice.
+    /// Number of computed snapshots. Snapshots that two runs share count twice.
     pub(super) fn snapshots_computed(&self) -> u64 {
         let total = |plan: SequencePlan| plan.runs().iter().map(|run| run.len() as u64).sum();
         self.sequence_plan().map_or(u64::from(self.snapshots.count), total)

@@ -112,7 +112,7 @@ impl RunSpec {
 }
 
 /// Largest number of voxels in a tile of a run: that of a snapshot of 30 frames with the default size. Sequences
-/// therefore take no more memory than large snapshots.
+/// therefore take as much memory as large snapshots at most.
 const RUN_VOXELS: usize = 30 * 320 * 320;
 /// Runs of at least this length do not need smaller tiles.
 const SUFFICIENT_LENGTH: u32 = 4;
@@ -133,7 +133,7 @@ pub struct CutRequest {
     pub tile_is_fixed: bool,
 }
 
-/// How a job is cut in space and in time.
+/// The cut of a job in space and in time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Cut {
     pub tile: TileSpec,

@@ -1,4 +1,4 @@
-//! Requests to make a calibration, measurement or model of uploads.
+//! Requests to create a calibration, measurement or model from uploads.
 
 use serde::{Deserialize, Serialize};
 
@@ -43,7 +43,7 @@ pub struct MeasurementRequest {
     /// Order of the array's axes; without it, the only one that fits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub axes: Option<Axes>,
-    /// Captures with the LCoS all black, at the measurement's exposure. Their average is subtracted.
+    /// Captures with the LCoS all black, at the measurement's exposure. The average of the captures is subtracted.
     #[serde(default)]
     pub dark: Vec<Sha256>,
     /// Smallest stored number of a saturated pixel.
@@ -95,7 +95,7 @@ impl Submission {
         }
     }
 
-    /// The calibration that it needs.
+    /// The calibration that the request needs.
     pub fn calibration(&self) -> Option<CalibrationId> {
         match self {
             Self::Calibration(_) => None,
@@ -133,7 +133,7 @@ impl Submission {
     }
 
     /// Refuses fields that contradict each other.
-    /// Errors: all that is wrong, each with its place.
+    /// Errors: all violations, each with its place.
     pub fn check(&self) -> Result<(), Vec<InvalidField>> {
         match self {
             Self::Calibration(request) => {
@@ -149,7 +149,7 @@ impl Submission {
     }
 }
 
-/// Refuses what is no full scale. Requests are stored as JSON, which would turn an infinity into null.
+/// Refuses an invalid full scale. Requests are stored as JSON, which would turn an infinity into null.
 fn check_full_scale(full_scale: Option<f32>) -> Result<(), Vec<InvalidField>> {
     let error = full_scale.and_then(|value| FullScale::new(value).err());
     error.map_or(Ok(()), |error| Err(vec![InvalidField::new("/full_scale", error.to_string())]))

@@ -69,8 +69,8 @@ impl Arrays {
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
         let y = window(&snapshots, frames, place)?;
         let masks = window(&masks, 0..masks.info().frames, place)?;
-        let whole = 0..y.dim().0;
-        Ok(TileInput { masks, y, white, pieces: vec![whole] })
+        let all_snapshots = 0..y.dim().0;
+        Ok(TileInput { masks, y, white, pieces: vec![all_snapshots] })
     }
 }
 

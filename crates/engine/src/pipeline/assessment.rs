@@ -73,10 +73,10 @@ impl TileAssessment {
     /// True if two assessments of equal frames agree to within 1 dB in each block, which allows for rounding on
     /// different processors.
     pub fn agrees_with(&self, other: &Self) -> bool {
-        let near = |(a, b): (&u8, &u8)| f32::from(a.abs_diff(*b)) <= LEVELS_PER_DB;
+        let is_close = |(a, b): (&u8, &u8)| f32::from(a.abs_diff(*b)) <= LEVELS_PER_DB;
         self.size == other.size
             && self.levels.len() == other.levels.len()
-            && self.levels.iter().zip(&other.levels).all(near)
+            && self.levels.iter().zip(&other.levels).all(is_close)
     }
 
     fn is_dark(&self) -> bool {

@@ -104,9 +104,9 @@ fn blend_tiles<'a, E>(
     plan: &TilePlan,
     mut part: impl FnMut(&Tile) -> Result<CowArray<'a, f32, Ix2>, E>,
 ) -> Result<Array2<f32>, E> {
-    let mut whole = Array2::zeros(plan.dim());
+    let mut frame = Array2::zeros(plan.dim());
     for tile in plan.tiles() {
-        plan.blend(&tile, part(&tile)?.view(), whole.view_mut());
+        plan.blend(&tile, part(&tile)?.view(), frame.view_mut());
     }
-    Ok(whole)
+    Ok(frame)
 }

@@ -4,7 +4,7 @@ use std::io;
 
 use super::networks::NetworkError;
 use crate::job::Sha256;
-use formats::FormatError;
+use formats::{DiskTrouble, FormatError};
 use reconstruction::ReconError;
 
 pub type Result<T, E = PipelineError> = std::result::Result<T, E>;
@@ -59,13 +59,12 @@ impl PipelineError {
         move |error| Self::Record { what, problem: error.to_string() }
     }
 
-    /// True if the disk is full or a quota is exhausted.
-    pub fn is_disk_full(&self) -> bool {
-        use io::ErrorKind::{QuotaExceeded, StorageFull};
+    /// The state of the disk that is the cause, if it is.
+    pub fn disk_trouble(&self) -> Option<DiskTrouble> {
         match self {
-            Self::Format(error) => error.is_disk_full(),
-            Self::File { source, .. } => matches!(source.kind(), QuotaExceeded | StorageFull),
-            _ => false,
+            Self::Format(error) => error.disk_trouble(),
+            Self::File { source, .. } => DiskTrouble::of(source),
+            _ => None,
         }
     }
 

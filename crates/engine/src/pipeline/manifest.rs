@@ -148,9 +148,10 @@ impl Recipe {
             *seconds_by_task.entry(kind.into_str()).or_insert(0.0) += seconds;
         }
         let entry = |(snapshot, record): (u32, SnapshotRecord)| {
-            let files = record.files.into_iter().filter(|file| file.name != "manifest.json");
-            let SnapshotRecord { summary, assessment, .. } = record;
-            SnapshotEntry { snapshot, summary, assessment, files: files.collect() }
+            let SnapshotRecord { summary, assessment, mut files, .. } = record;
+            files.retain(|file| file.name != "manifest.json");
+            files.sort_by(|a, b| a.name.cmp(&b.name));
+            SnapshotEntry { snapshot, summary, assessment, files }
         };
         let snapshots = snapshots.into_iter().map(entry).collect();
         JobManifest {

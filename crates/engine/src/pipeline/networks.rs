@@ -413,9 +413,9 @@ mod tests {
     fn networks_of_a_folder_replace_the_embedded_ones_and_are_recorded() {
         let carried = NetworkSource::new(None, Device::Cpu);
         let folder = tempfile::tempdir().unwrap();
-        let own = carried.clone().with_models(Some(folder.path().into()));
+        let custom = carried.clone().with_models(Some(folder.path().into()));
         let schedule = Algorithm::PnpFfdnet.default_schedule();
-        let error = own.records(&schedule).unwrap_err().to_string();
+        let error = custom.records(&schedule).unwrap_err().to_string();
         assert!(error.contains("ffdnet-gray/model.onnx"), "{error}");
 
         let file = folder.path().join("ffdnet-gray/model.onnx");
@@ -423,10 +423,10 @@ mod tests {
         let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/ffdnet-gray/model.onnx");
         let mut content = std::fs::read(shipped).unwrap();
         std::fs::write(&file, &content).unwrap();
-        assert_eq!(own.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
+        assert_eq!(custom.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
         content.push(0);
         std::fs::write(&file, &content).unwrap();
-        assert_ne!(own.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
+        assert_ne!(custom.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
     }
 
     #[test]
@@ -447,8 +447,8 @@ mod tests {
                 .unwrap();
         let models = models.as_object().unwrap().values();
         let encodings = models.map(|model| &model["encoding"]).filter(|it| !it.is_null());
-        let own = Sha256::of(FASTDVDNET_GRAY_ENCODER).to_string();
-        assert_eq!(encodings.map(|encoding| &encoding["encoder"]).collect::<Vec<_>>(), [&own; 2]);
+        let hash = Sha256::of(FASTDVDNET_GRAY_ENCODER).to_string();
+        assert_eq!(encodings.map(|encoding| &encoding["encoder"]).collect::<Vec<_>>(), [&hash; 2]);
     }
 
     #[test]

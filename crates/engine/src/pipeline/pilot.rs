@@ -1,4 +1,4 @@
-//! The pilot of a job: it adapts the schedule, and decides which snapshots are reconstructed together, once for all tiles.
+//! The pilot of a job. It adapts the schedule and decides which snapshots are reconstructed together, once for all tiles.
 
 use ndarray::{ArrayView2, s};
 
@@ -16,17 +16,21 @@ use reconstruction::{ReconError, crop, pilot};
 /// The task of a pilot, and the crop of the snapshots on which it runs.
 #[derive(Debug, Clone, Copy)]
 pub struct Pilot<'a> {
-    /// The index of the first snapshot in the measurement.
+    /// Index of the first snapshot in the measurement.
     pub first: usize,
-    /// The crop's place in the picture.
-    pub place: &'a Window,
+    /// Position of the crop in the picture.
+    pub crop: &'a Window,
     pub schedule: &'a Schedule,
     pub runs: &'a SequencePlan,
 }
 
-/// The crop of a snapshot \[H,W\] on which the pilot runs: of the picture, or of the first green sub-image of a mosaic.
-/// `light` is the sum \[H,W\] of all masks.
-pub fn place(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, mosaic: Option<Mosaic>) -> Window {
+/// Chooses the crop of a snapshot \[H,W\] on which the pilot runs. Behind a mosaic, it is a crop of the first green
+/// sub-image. `light` is the sum \[H,W\] of all masks.
+pub fn choose_crop(
+    light: ArrayView2<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    mosaic: Option<Mosaic>,
+) -> Window {
     let Some(mosaic) = mosaic else {
         let (rows, columns) = crop::choose(light, y);
         return Window { rows, columns, step: 1 };
@@ -37,9 +41,9 @@ pub fn place(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>, mosaic: Option<
     Window::of_plane(rows, columns, first)
 }
 
-/// Runs the pilot on a crop of all snapshots: it adapts the schedule to the first one, and then compares neighbouring
-/// snapshots, together and alone, with the decided schedule. Returns `None` if there is nothing to decide, or no light
-/// reaches the crop.
+/// Runs the pilot on a crop of all snapshots. It adapts the schedule to the first one. With that schedule it then solves
+/// neighbouring snapshots together and alone, and compares the results. Returns `None` if there is nothing to decide, or
+/// if no light reaches the crop.
 ///
 /// # Errors
 /// As [`pilot::decide`] and [`joints::compare`].
@@ -49,14 +53,14 @@ pub fn decide(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Option<PilotRecord>, ReconError> {
-    let &Pilot { first, place, schedule, runs } = task;
+    let &Pilot { first, crop, schedule, runs } = task;
     let candidates = runs.joints();
     if !schedule.adaptive && candidates.is_empty() {
         return Ok(None);
     }
-    let (row, column) = (place.rows.start, place.columns.start);
+    let (row, column) = (crop.rows.start, crop.columns.start);
     let (_, height, width) = input.y.dim();
-    let (height, width) = (height * place.step, width * place.step);
+    let (height, width) = (height * crop.step, width * crop.step);
     let Some((op, y)) = input.on_unit_scale()? else { return Ok(None) };
     let mut record = PilotRecord {
         snapshot: first,
@@ -74,8 +78,9 @@ pub fn decide(
         (record.stages, record.evidence) = (decisions.stages, decisions.evidence);
     }
     let decided = record.decide(schedule);
-    let found = joints::compare(&op, (first, y.view()), &candidates, &decided, networks, observer)?;
-    record.joints = found.into_iter().map(joint).collect();
+    let findings =
+        joints::compare(&op, (first, y.view()), &candidates, &decided, networks, observer)?;
+    record.joints = findings.into_iter().map(joint).collect();
     Ok(Some(record))
 }
 
@@ -89,7 +94,7 @@ fn joint(finding: JointFinding) -> JointRecord {
     }
 }
 
-/// The schedule that the tiles run: as decided by the pilot, if there was one.
+/// The schedule that the tiles run: that of the pilot, if there was one.
 pub fn full_schedule(schedule: &Schedule, pilot: Option<&PilotRecord>) -> Schedule {
     pilot.map_or_else(|| schedule.clone(), |pilot| pilot.decide(schedule))
 }

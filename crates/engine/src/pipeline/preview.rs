@@ -23,22 +23,22 @@ pub fn frames(
     let SceneShape { frames, height, width, .. } = shape;
     if shape.mosaic.is_none() {
         let report = |share| monitor.reach(TaskStage::Tv, share);
-        let place = Window::whole(height, width);
-        return window_frames(arrays, (frames, snapshot, white), &place, monitor, report);
+        let window = Window::whole(height, width);
+        return window_frames(arrays, (frames, snapshot, white), &window, monitor, report);
     }
-    let mut whole = Array3::zeros((0, 0, 0));
+    let mut joined = Array3::zeros((0, 0, 0));
     for plane in 0..4 {
         let first = (plane / 2, plane % 2);
-        let place = Window::of_plane(0..height / 2, 0..width / 2, first);
+        let window = Window::of_plane(0..height / 2, 0..width / 2, first);
         let report = |share| monitor.reach(TaskStage::Tv, (plane as f64 + share) / 4.0);
-        let part = window_frames(arrays, (frames, snapshot, white), &place, monitor, report)?;
+        let part = window_frames(arrays, (frames, snapshot, white), &window, monitor, report)?;
         let (frames, rows, columns) = part.dim();
-        if whole.is_empty() {
-            whole = Array3::zeros((frames, 2 * rows, 2 * columns));
+        if joined.is_empty() {
+            joined = Array3::zeros((frames, 2 * rows, 2 * columns));
         }
-        whole.slice_mut(s![.., first.0..;2, first.1..;2]).assign(&part);
+        joined.slice_mut(s![.., first.0..;2, first.1..;2]).assign(&part);
     }
-    Ok(whole)
+    Ok(joined)
 }
 
 /// Coarse frames \[B,h,w\] of a window of a snapshot.

@@ -1,4 +1,4 @@
-//! How far a computation is, and how it is stopped.
+//! Progress and cancellation of a computation.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,12 +13,12 @@ use reconstruction::priors::Family;
 use reconstruction::schedule::Schedule;
 use reconstruction::solver::{Control, Observer, Progress};
 
-/// What a computing thread and whoever watches over it tell each other.
+/// State that a computing thread shares with the thread that watches it.
 #[derive(Debug)]
 pub struct Monitor {
-    /// Where the task stands, and its last sign of life.
+    /// The progress, and the time of the last sign of life.
     progress: Mutex<(TaskProgress, Instant)>,
-    /// How the solver went, and whether there is more of it than was last told.
+    /// The solver's history, and whether it has grown since it was last reported.
     history: Mutex<(History, bool)>,
     stop: AtomicBool,
 }
@@ -32,7 +32,7 @@ impl Default for Monitor {
 
 impl Monitor {
     fn lock(&self) -> MutexGuard<'_, (TaskProgress, Instant)> {
-        // Whole values are stored: a poisoned lock holds a good one.
+        // Every change is a single assignment, so the value is valid even if a thread panicked.
         self.progress.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -40,22 +40,22 @@ impl Monitor {
         self.lock().0
     }
 
-    /// How long ago the computing thread gave its last sign of life.
+    /// Time since the last sign of life of the computing thread.
     pub fn silence(&self) -> Duration {
         self.lock().1.elapsed()
     }
 
-    /// A sign of life: where the task stands now.
+    /// Records the progress, which is also a sign of life.
     pub fn set_progress(&self, progress: TaskProgress) {
         *self.lock() = (progress, Instant::now());
     }
 
-    /// The same for a stage that counts no iterations.
+    /// Records the progress of a stage without iterations.
     pub fn reach(&self, stage: TaskStage, fraction: f64) {
         self.set_progress(TaskProgress { stage, fraction, ..self.progress() });
     }
 
-    /// How the solver went, as JSON; none if that was told before and nothing came after.
+    /// Returns the solver's history as JSON if it has grown since the last call.
     pub fn news(&self) -> Option<String> {
         let mut history = self.history.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::take(&mut history.1).then(|| history.0.to_json())
@@ -71,13 +71,13 @@ impl Monitor {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// A sign of life; [`PipelineError::Stopped`] once [`Monitor::stop`] was called.
+    /// Gives a sign of life. Returns [`PipelineError::Stopped`] once [`Monitor::stop`] was called.
     pub fn check(&self) -> Result<()> {
         self.lock().1 = Instant::now();
         if self.stopped() { Err(PipelineError::Stopped) } else { Ok(()) }
     }
 
-    /// An observer of one run of a schedule, which reports here.
+    /// An observer of one run of a schedule that reports to this monitor.
     pub fn observe(&self, schedule: Schedule) -> impl Observer {
         MonitorObserver {
             monitor: self,
@@ -91,7 +91,7 @@ impl Monitor {
 struct MonitorObserver<'a> {
     monitor: &'a Monitor,
     share: ShareDone,
-    /// The share of the task that the solver's run is.
+    /// The part of the task, on \[0,1\], that the solver's run covers.
     part: Range<f64>,
     passes: u32,
 }
@@ -102,7 +102,7 @@ impl Observer for MonitorObserver<'_> {
         {
             let history = &self.monitor.history;
             let mut history = history.lock().unwrap_or_else(PoisonError::into_inner);
-            history.0.note(progress);
+            history.0.record(progress);
             history.1 = true;
         }
         self.monitor.set_progress(TaskProgress {
@@ -118,12 +118,12 @@ impl Observer for MonitorObserver<'_> {
     fn part(&mut self, share: Range<f64>) {
         self.share.restart();
         self.part = share;
-        // A plot shows one run of the solver: the last.
+        // A plot shows only the last run of the solver.
         *self.monitor.history.lock().unwrap_or_else(PoisonError::into_inner) = Default::default();
     }
 }
 
-/// The part of a tile's work that iterations with a prior of this kind are.
+/// The stage of a task that iterations with a prior of this family belong to.
 fn stage(family: Family) -> TaskStage {
     match family {
         Family::TotalVariation => TaskStage::Tv,
@@ -132,7 +132,7 @@ fn stage(family: Family) -> TaskStage {
     }
 }
 
-/// Turns the solver's progress into the share of the planned cost that is behind it.
+/// Converts the solver's progress into the finished share of the planned cost.
 #[derive(Debug, Clone)]
 pub(super) struct ShareDone {
     schedule: Schedule,
@@ -145,13 +145,13 @@ impl ShareDone {
         Self { schedule, stage: 0, iterations: 0 }
     }
 
-    /// To be called where another run of the schedule begins.
+    /// Starts another run of the schedule.
     pub(super) fn restart(&mut self) {
         (self.stage, self.iterations) = (0, 0);
     }
 
-    /// The share on \[0,1\] after the iteration that `progress` tells of; to be called for
-    /// every iteration. A stage that ends early lets the share jump.
+    /// The share on \[0,1\] after the iteration in `progress`. Must be called for every iteration. The share jumps
+    /// when a stage ends early.
     pub(super) fn after(&mut self, progress: &Progress) -> f64 {
         if progress.stage != self.stage {
             (self.stage, self.iterations) = (progress.stage, 0);
@@ -161,10 +161,10 @@ impl ShareDone {
     }
 }
 
-/// The most points that are kept, beside the last.
+/// Largest number of kept points, not counting the last one.
 const POINTS: usize = 128;
 
-/// What an iteration told.
+/// The values of one iteration.
 #[derive(Debug, Clone, Copy)]
 struct Point {
     iteration: usize,
@@ -173,20 +173,21 @@ struct Point {
     sigma: Option<f32>,
 }
 
-/// A record of iterations that is thinned out as it grows: of many, every second, fourth, eighth ...
-/// is kept, and always the last.
+/// A record of iterations that is log2_step out as it grows: it keeps every second, fourth or eighth point and so on, and
+/// always the last.
 #[derive(Debug, Default)]
 struct History {
     points: Vec<Point>,
     last: Option<Point>,
-    /// Iterations seen, of which each 2^`thinned`-th is kept.
-    seen: usize,
-    thinned: u32,
+    /// Number of recorded iterations.
+    count: usize,
+    /// Base-2 logarithm of the distance between kept points.
+    log2_step: u32,
 }
 
 impl History {
-    /// Takes note of an iteration.
-    fn note(&mut self, progress: &Progress) {
+    /// Records an iteration.
+    fn record(&mut self, progress: &Progress) {
         let point = Point {
             iteration: progress.done,
             residual: progress.residual,
@@ -199,19 +200,19 @@ impl History {
                 index += 1;
                 index % 2 == 1
             });
-            self.thinned += 1;
+            self.log2_step += 1;
         }
-        if self.seen.is_multiple_of(1 << self.thinned) {
+        if self.count.is_multiple_of(1 << self.log2_step) {
             self.points.push(point);
         }
-        self.seen += 1;
+        self.count += 1;
         self.last = Some(point);
     }
 
     /// \[\[iteration, residual, change, sigma or null\], ...\] as JSON.
     fn to_json(&self) -> String {
-        let kept = self.points.last().map(|point| point.iteration);
-        let last = self.last.filter(|last| Some(last.iteration) != kept);
+        let last_kept = self.points.last().map(|point| point.iteration);
+        let last = self.last.filter(|last| Some(last.iteration) != last_kept);
         let show = |point: &Point| {
             let sigma = point.sigma.map_or(Value::Null, rounded);
             json!([point.iteration, rounded(point.residual), rounded(point.change), sigma])
@@ -229,10 +230,10 @@ pub fn is_history(text: &str, iterations: usize) -> bool {
     })
 }
 
-/// Four digits are more than a plot shows.
+/// Rounds to four digits, which are more than a plot shows.
 fn rounded(value: f32) -> Value {
     let text = format!("{value:.3e}");
-    // What is not finite has no place in JSON.
+    // JSON has no infinity and no NaN.
     text.parse::<f64>().ok().filter(|value| value.is_finite()).into()
 }
 
@@ -249,7 +250,7 @@ mod tests {
         for done in 1..=iterations {
             let (residual, change) = (1.0 / done as f32, f32::INFINITY);
             let sigma = (done % 2 == 0).then_some(0.1);
-            history.note(&Progress {
+            history.record(&Progress {
                 stage: 0,
                 done,
                 planned: 9,

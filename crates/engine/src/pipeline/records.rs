@@ -1,4 +1,4 @@
-//! What the tasks of a job leave for those that follow, and for the manifests.
+//! Records of a job's tasks, for later tasks and for the manifests.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -25,9 +25,9 @@ pub struct PilotRecord {
     pub column: usize,
     pub height: usize,
     pub width: usize,
-    /// The stages of the requested schedule; none if it is fixed.
+    /// The decided stages. Empty for a fixed schedule.
     pub stages: Vec<Decided>,
-    /// Whether snapshots that follow one another belong together, joint by joint.
+    /// The decisions on the joints between consecutive snapshots.
     #[serde(default)]
     pub joints: Vec<JointRecord>,
     /// Hold-out evidence of the error of an adaptive schedule's frames.
@@ -36,33 +36,33 @@ pub struct PilotRecord {
 }
 
 impl PilotRecord {
-    /// The schedule that the pilot decided on; `schedule` itself if it is fixed.
+    /// The schedule that the pilot has decided. Returns a fixed schedule unchanged.
     pub fn decide(&self, schedule: &Schedule) -> Schedule {
         if self.stages.is_empty() { schedule.clone() } else { schedule.decided(&self.stages) }
     }
 
-    /// The joints that are taken apart, each given by the snapshot before it.
+    /// The snapshots after which the sequence is cut.
     pub fn cuts(&self) -> Vec<usize> {
-        let apart = self.joints.iter().filter(|joint| !joint.together);
-        apart.map(|joint| joint.after).collect()
+        let cut = self.joints.iter().filter(|joint| !joint.together);
+        cut.map(|joint| joint.after).collect()
     }
 }
 
-/// What the pilot found out about a joint.
+/// The pilot's decision on the joint between two snapshots.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct JointRecord {
-    /// The index of the snapshot before it; that behind it is the next.
+    /// Index of the snapshot before the joint.
     pub after: usize,
-    /// Whether both snapshots are reconstructed together.
+    /// True if both snapshots are reconstructed together.
     pub together: bool,
-    /// Error at the held-out pixels of both snapshots, each alone, relative to the measurement; null where
-    /// the solver diverged.
+    /// Hold-out error of both snapshots when each is solved alone, relative to the measurement. `None` if the solver
+    /// diverged.
     pub error_alone: Option<f64>,
-    /// The same of both together.
+    /// Hold-out error of both snapshots when they are solved together, relative to the measurement.
     pub error_together: Option<f64>,
 }
 
-/// The settings that a pilot changed, as a text with a leading comma each, such as `, gamma 1`.
+/// Lists the settings that a pilot has changed. Each has a leading comma, such as `, gamma 1`.
 pub fn changes(decided: &Decided) -> String {
     let fields = |stage| match serde_json::to_value(stage) {
         Ok(Value::Object(fields)) => fields,
@@ -116,30 +116,30 @@ impl From<&Outcome> for TileRecord {
 pub struct TileTaskRecord {
     #[serde(flatten)]
     pub tile: TileRecord,
-    /// The snapshots that have frames here, by their place in the run; the others are left to another run.
+    /// The solved snapshots, as indices in the run. Another run solves the others.
     pub solved: Vec<usize>,
     /// `None` if nothing can be estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assessment: Option<TileAssessment>,
-    /// From reading its window to its frames.
+    /// Cost of the tile, from reading its window to its frames.
     #[serde(flatten)]
     pub cost: CostRecord,
 }
 
-/// What computing took, and on what.
+/// Cost of a computation, and the runtime that performed it.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct CostRecord {
-    /// Execution provider of the network; none without a network.
+    /// Execution provider of the network. `None` without a network.
     pub provider: Option<String>,
-    /// Build of ONNX Runtime; none without a network.
+    /// Version of ONNX Runtime. `None` without a network.
     pub onnxruntime: Option<String>,
     pub cpu_seconds: f64,
-    /// Largest resident memory of a process that computed.
+    /// Largest resident memory of a computing process.
     pub peak_rss_bytes: u64,
 }
 
 impl CostRecord {
-    /// Of several parts taken together.
+    /// The total cost of several parts.
     pub fn sum<'a>(parts: impl Iterator<Item = &'a Self>) -> Self {
         parts.fold(Self::default(), |sum, part| Self {
             provider: sum.provider.or_else(|| part.provider.clone()),
@@ -152,25 +152,25 @@ impl CostRecord {
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
-    /// The job; none on the command line.
+    /// The job. `None` on the command line.
     pub job: Option<String>,
-    /// Of all tiles together.
+    /// Total cost of all tiles.
     #[serde(flatten)]
     pub cost: CostRecord,
-    /// Wall time of computing; none for a job, whose workers share their time with others'.
+    /// Wall time of the computation. `None` for a job, because its workers also serve other jobs.
     pub seconds: Option<f64>,
-    /// When it ended, RFC 3339 in UTC.
+    /// End of the run, RFC 3339 in UTC.
     pub finished_at: String,
 }
 
 impl RunRecord {
-    /// Of a run that ends now.
+    /// The record of a run that ends now.
     pub fn ended(job: Option<String>, cost: CostRecord, seconds: Option<f64>) -> Self {
         Self { job, cost, seconds, finished_at: Timestamp::now().to_string() }
     }
 }
 
-/// The tiles of a snapshot taken together.
+/// Summary of a snapshot's tiles.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
     /// Largest number of any tile.
@@ -179,7 +179,7 @@ pub struct Summary {
     pub tv_iterations: usize,
     /// Largest number of any tile.
     pub denoiser_passes: usize,
-    /// Largest of any tile.
+    /// Largest value of the tiles.
     pub residual: f32,
     /// `converged` if all tiles converged, else `max-iterations`.
     pub stop_reason: String,
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_summary_tells_the_worst_of_the_tiles() {
+    fn a_summary_has_the_largest_values_of_the_tiles() {
         let tiles = [record(0.01, "converged", 20), record(0.03, "max-iterations", 24)];
         let summary = Summary::of(&tiles);
         assert_eq!((summary.denoiser_passes, summary.residual), (24, 0.03));

@@ -1,4 +1,4 @@
-//! How much of a measurement the frames of a tile leave unexplained.
+//! The residual of a tile: the part of the measurement that its frames do not explain.
 
 use std::ops::Range;
 
@@ -62,12 +62,13 @@ mod tests {
         let y = Array3::from_shape_fn((3, 4, 4), |(s, ..)| s as f32);
         // Frames that explain half of every snapshot, and more than nothing of the first.
         let half = |k: usize| Ok::<_, Infallible>(Array2::from_elem((4, 4), (k / 2) as f32 / 4.0));
-        let of = |pieces: &[std::ops::Range<usize>]| residual(masks.view(), y.view(), pieces, half);
-        assert_eq!(of(&[1..3]), Ok(0.5));
-        assert_eq!(of(&[0..1, 1..2]), Ok(0.5));
+        let residual_of =
+            |pieces: &[std::ops::Range<usize>]| residual(masks.view(), y.view(), pieces, half);
+        assert_eq!(residual_of(&[1..3]), Ok(0.5));
+        assert_eq!(residual_of(&[0..1, 1..2]), Ok(0.5));
         let bright = |_| Ok::<_, Infallible>(Array2::ones((4, 4)));
-        let found = residual(masks.view(), y.view(), &[0..1], bright);
-        assert_eq!(found, Ok(f32::MAX), "something where nothing was measured");
+        let value = residual(masks.view(), y.view(), &[0..1], bright);
+        assert_eq!(value, Ok(f32::MAX), "something where nothing was measured");
         let dark = Array3::zeros((2, 4, 4));
         assert_eq!(residual(dark.view(), y.view(), &[0..3], bright), Ok(0.0));
     }

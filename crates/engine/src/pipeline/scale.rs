@@ -15,12 +15,12 @@ use reconstruction::scale::ScaleEstimator;
 pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
     let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
     let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
-    let none = || ReconError::Shape {
+    let no_snapshots = || ReconError::Shape {
         what: "the measurement",
         found: "no snapshots".into(),
         expected: "at least one".into(),
     };
-    median_white(whites.collect::<Result<_, _>>()?).ok_or_else(none)
+    median_white(whites.collect::<Result<_, _>>()?).ok_or_else(no_snapshots)
 }
 
 /// The white level of the stored snapshots of a job. It reads one plane at a time.
@@ -38,8 +38,9 @@ pub fn job_white_level(
         let white = estimator.white(arrays.snapshot(snapshot)?.view());
         whites.push(white.map_err(|source| PipelineError::Snapshot { snapshot, source })?);
     }
-    let none = || PipelineError::Record { what: "job", problem: "it has no snapshots".into() };
-    median_white(whites).ok_or_else(none)
+    let no_snapshots =
+        || PipelineError::Record { what: "job", problem: "it has no snapshots".into() };
+    median_white(whites).ok_or_else(no_snapshots)
 }
 
 /// The median (the lower one of two) of the snapshots' white levels; `None` without snapshots. Unlike the maximum, the

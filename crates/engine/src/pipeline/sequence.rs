@@ -1,4 +1,4 @@
-//! Snapshots in memory, their tiles on several threads.
+//! Reconstructs snapshots in memory, with their tiles on several threads.
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -26,22 +26,22 @@ pub struct SequenceInput<'a> {
     pub masks: ArrayView3<'a, f32>,
     /// Snapshots \[S,H,W\].
     pub measurement: ArrayView3<'a, f32>,
-    /// The index of the first of them in the measurement.
+    /// Index of the first snapshot in the measurement.
     pub first: usize,
     pub white: f32,
     pub solver: Solver<'a>,
-    /// The cut in space; it has the size of the masks.
+    /// The cut in space. It has the size of the masks.
     pub plan: &'a TilePlan,
-    /// The cut in time, of these snapshots.
+    /// The cut of the snapshots in time.
     pub runs: &'a SequencePlan,
-    /// The sensor's colours; the plan is one of a mosaic then.
+    /// The sensor's colours. With a mosaic, `plan` must be one of a mosaic.
     pub mosaic: Option<Mosaic>,
 }
 
 #[derive(Debug, Clone, Copy)]
 pub enum Solver<'a> {
     Schedule(&'a Schedule),
-    /// By runs of an end-to-end network.
+    /// Runs an end-to-end network.
     Network(&'a ModelFile),
 }
 
@@ -64,18 +64,18 @@ impl SequenceInput<'_> {
         }
     }
 
-    /// The snapshots, by their indices in the measurement.
+    /// Indices of the snapshots in the measurement.
     fn snapshots(&self) -> Range<usize> {
         self.first..self.first + self.measurement.dim().0
     }
 }
 
-/// Snapshots whose tiles are solved.
+/// The solved tiles of snapshots.
 #[derive(Debug)]
 pub struct Solved {
-    /// Of each run the tiles in the plan's order.
+    /// The tiles of each run, in the plan's order.
     pub runs: Vec<Vec<Outcome>>,
-    /// What the pilot found of an adaptive schedule, and of the joints between snapshots.
+    /// The pilot's decisions on an adaptive schedule and on the joints between snapshots.
     pub pilot: Option<PilotRecord>,
 }
 
@@ -86,13 +86,13 @@ impl Solved {
         blend::frame(input.plan, &shares, &self.runs, k)
     }
 
-    /// What came of each tile that has a part in a snapshot, run by run.
+    /// The records of the tiles that contribute to a snapshot, run by run.
     pub fn records(&self, input: &SequenceInput<'_>, snapshot: usize) -> Vec<TileRecord> {
         let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
         shares.iter().flat_map(|share| &self.runs[share.run]).map(TileRecord::from).collect()
     }
 
-    /// What the tiles of a snapshot let expect, run by run, in the plan's order.
+    /// The assessments of the tiles of a snapshot, run by run, in the plan's order.
     pub fn assessments(
         &self,
         input: &SequenceInput<'_>,
@@ -101,13 +101,13 @@ impl Solved {
     ) -> Vec<(RunShare, Vec<Option<TileAssessment>>)> {
         let shares = input.runs.shares(snapshot, &self.cuts(), input.masks.dim().0);
         let evidence = self.pilot.as_ref().and_then(|pilot| pilot.evidence.as_ref());
-        let by = (schedule, evidence, input.white);
-        let of = |share: RunShare| {
+        let context = (schedule, evidence, input.white);
+        let assess = |share: RunShare| {
             let tiles = self.runs[share.run].iter();
-            let found = tiles.map(|tile| TileAssessment::of(tile, by)).collect();
-            (share, found)
+            let assessments = tiles.map(|tile| TileAssessment::of(tile, context)).collect();
+            (share, assessments)
         };
-        shares.into_iter().map(of).collect()
+        shares.into_iter().map(assess).collect()
     }
 
     fn cuts(&self) -> Vec<usize> {
@@ -115,13 +115,12 @@ impl Solved {
     }
 }
 
-/// Hears of a tile, by its index (run by run, in the plan's order), which share of its work is done, on
-/// \[0,1\]; called from all threads.
+/// Receives the index of a tile (run by run, in the plan's order) and the finished share of its work on \[0,1\]. It is
+/// called from all threads.
 pub type TileProgress<'a> = &'a (dyn Fn(usize, f64) + Sync);
 
-/// Solves all tiles of all runs on up to `threads` threads, one denoiser a thread; an adaptive schedule,
-/// and whether snapshots belong together, is decided before. The result does not depend on the number of
-/// threads.
+/// Solves all tiles of all runs on up to `threads` threads, with one denoiser per thread. The pilot first decides an
+/// adaptive schedule and the cuts between snapshots. The result does not depend on the number of threads.
 /// Errors: the first failure of any tile; the others stop at their next iteration.
 pub fn solve(
     input: &SequenceInput<'_>,
@@ -133,10 +132,10 @@ pub fn solve(
     if let Solver::Schedule(schedule) = input.solver {
         let light = input.masks.sum_axis(Axis(0));
         let first = input.measurement.index_axis(Axis(0), 0);
-        let place = pilot::place(light.view(), first, input.mosaic);
+        let crop = pilot::choose_crop(light.view(), first, input.mosaic);
         let mut networks = WarmNetworks::new(network.clone());
-        let window = input.window(input.snapshots(), place.clone(), Vec::new());
-        let task = pilot::Pilot { first: input.first, place: &place, schedule, runs: input.runs };
+        let window = input.window(input.snapshots(), crop.clone(), Vec::new());
+        let task = pilot::Pilot { first: input.first, crop: &crop, schedule, runs: input.runs };
         pilot = pilot::decide(window, &task, &mut networks, &mut ())?;
     }
     let decided = match (&pilot, input.solver) {
@@ -156,7 +155,7 @@ pub fn solve(
     Ok(Solved { runs, pilot })
 }
 
-/// All tiles, run by run.
+/// Solves all tiles, run by run.
 fn run_tiles(
     input: &SequenceInput<'_>,
     pieces: &[Piece],
@@ -176,16 +175,16 @@ fn run_tiles(
         let mut done = Vec::new();
         while let Some((index, run, tile)) = claim() {
             let snapshots = input.runs.runs()[run].clone();
-            let own = pieces.iter().filter(|piece| piece.run == run);
+            let run_pieces = pieces.iter().filter(|piece| piece.run == run);
             let first = snapshots.start;
-            let own =
-                own.map(|Piece { snapshots, .. }| snapshots.start - first..snapshots.end - first);
-            let window = input.window(snapshots, tile.window(), own.collect());
+            let run_pieces = run_pieces
+                .map(|Piece { snapshots, .. }| snapshots.start - first..snapshots.end - first);
+            let window = input.window(snapshots, tile.window(), run_pieces.collect());
             let outcome = match input.solver {
                 Solver::Schedule(schedule) => {
                     let share = ShareDone::new(schedule.clone());
-                    let tell = |share| progress(index, share);
-                    let mut observer = TileObserver { tell, stop: &stop, share, part: 0.0..1.0 };
+                    let report = |share| progress(index, share);
+                    let mut observer = TileObserver { report, stop: &stop, share, part: 0.0..1.0 };
                     reconstruct_tile(window, schedule, &mut networks, &mut observer)?
                 }
                 Solver::Network(_) if stop.load(Ordering::Relaxed) => {
@@ -208,7 +207,7 @@ fn run_tiles(
     for outcome in outcomes {
         match outcome {
             Ok(tiles) => done.extend(tiles),
-            // Threads that were stopped say so; the cause is the other error.
+            // Stopped threads return this; the other error is the cause.
             Err(PipelineError::Stopped) if failure.is_some() => {}
             Err(error) => failure = Some(error),
         }
@@ -218,7 +217,7 @@ fn run_tiles(
 }
 
 struct TileObserver<'a, F> {
-    tell: F,
+    report: F,
     stop: &'a AtomicBool,
     share: ShareDone,
     part: Range<f64>,
@@ -227,7 +226,7 @@ struct TileObserver<'a, F> {
 impl<F: Fn(f64)> Observer for TileObserver<'_, F> {
     fn iteration(&mut self, progress: &Progress) -> Control {
         let Range { start, end } = self.part;
-        (self.tell)(start + (end - start) * self.share.after(progress));
+        (self.report)(start + (end - start) * self.share.after(progress));
         if self.stop.load(Ordering::Relaxed) { Control::Cancel } else { Control::Continue }
     }
 
@@ -260,8 +259,8 @@ mod tests {
     }
 
     fn snapshots(masks: &Array3<f32>, frames: &Array3<f32>) -> Array3<f32> {
-        let of_one = |frames| measure(masks.view(), frames).unwrap();
-        let all: Vec<_> = frames.axis_chunks_iter(Axis(0), 4).map(of_one).collect();
+        let snapshot = |frames| measure(masks.view(), frames).unwrap();
+        let all: Vec<_> = frames.axis_chunks_iter(Axis(0), 4).map(snapshot).collect();
         let views: Vec<_> = all.iter().map(|snapshot| snapshot.view()).collect();
         ndarray::stack(Axis(0), &views).unwrap()
     }
@@ -285,7 +284,7 @@ mod tests {
     fn the_number_of_threads_changes_nothing_and_seams_are_small() {
         let (masks, truth) = scene(96);
         let y = snapshots(&masks, &truth);
-        // Fixed, so that all are solved alike.
+        // A fixed schedule solves all cuts in the same way.
         let schedule = Schedule::gap_tv3d().with_iterations(100);
         let frames = |plan: &TilePlan, runs: &SequencePlan, threads| {
             let input = input(&masks, &y, &schedule, (plan, runs));
@@ -343,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cause_of_a_failure_is_told_not_its_consequence() {
+    fn the_error_is_the_cause_of_a_failure() {
         let (masks, truth) = scene(96);
         let mut y = snapshots(&masks, &truth);
         y[[4, 90, 90]] = f32::NAN;

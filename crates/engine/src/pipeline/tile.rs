@@ -74,7 +74,7 @@ impl TileInput {
     {
         let ((frames, height, width), white) = (self.masks.dim(), self.white);
         let (pieces, measured) = (self.pieces.clone(), self.y.clone());
-        let mut whole = Outcome {
+        let mut combined = Outcome {
             frames: Array3::zeros((self.y.dim().0 * frames, height, width)),
             iterations: 0,
             tv_iterations: 0,
@@ -84,7 +84,7 @@ impl TileInput {
             features: None,
             evidence: None,
         };
-        let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(whole) };
+        let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(combined) };
         let total: usize = pieces.iter().map(Range::len).sum();
         let share = |snapshots: usize| snapshots as f64 / total as f64;
         let mut done = 0;
@@ -94,28 +94,28 @@ impl TileInput {
             done += piece.len();
             let outcome = solve(&op, y.slice(s![piece.clone(), .., ..]), work)?;
             if piece.len() == y.dim().0 {
-                whole = outcome;
+                combined = outcome;
                 continue;
             }
-            let place = s![piece.start * frames..piece.end * frames, .., ..];
-            whole.frames.slice_mut(place).assign(&outcome.frames);
+            let range = s![piece.start * frames..piece.end * frames, .., ..];
+            combined.frames.slice_mut(range).assign(&outcome.frames);
             if let Some(part) = outcome.features {
                 let (features, _, rows, columns) = part.dim();
-                let zeros = || Array4::zeros((features, whole.frames.dim().0, rows, columns));
-                let place = s![.., piece.start * frames..piece.end * frames, .., ..];
-                whole.features.get_or_insert_with(zeros).slice_mut(place).assign(&part);
+                let zeros = || Array4::zeros((features, combined.frames.dim().0, rows, columns));
+                let range = s![.., piece.start * frames..piece.end * frames, .., ..];
+                combined.features.get_or_insert_with(zeros).slice_mut(range).assign(&part);
             }
-            whole.iterations = whole.iterations.max(outcome.iterations);
-            whole.tv_iterations = whole.tv_iterations.max(outcome.tv_iterations);
-            whole.denoiser_passes = whole.denoiser_passes.max(outcome.denoiser_passes);
+            combined.iterations = combined.iterations.max(outcome.iterations);
+            combined.tv_iterations = combined.tv_iterations.max(outcome.tv_iterations);
+            combined.denoiser_passes = combined.denoiser_passes.max(outcome.denoiser_passes);
             if outcome.stop_reason == StopReason::MaxIterations {
-                whole.stop_reason = StopReason::MaxIterations;
+                combined.stop_reason = StopReason::MaxIterations;
             }
         }
-        whole.frames *= white;
-        let frame = |k| Ok::<_, ReconError>(whole.frames.index_axis(Axis(0), k).to_owned());
-        whole.residual = residual(op.masks(), measured.view(), &pieces, frame)?;
-        Ok(whole)
+        combined.frames *= white;
+        let frame = |k| Ok::<_, ReconError>(combined.frames.index_axis(Axis(0), k).to_owned());
+        combined.residual = residual(op.masks(), measured.view(), &pieces, frame)?;
+        Ok(combined)
     }
 }
 

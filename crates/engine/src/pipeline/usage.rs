@@ -7,9 +7,9 @@ use rustix::time::{ClockId, clock_gettime};
 
 /// CPU time (user and system) in seconds of this process and its terminated children.
 pub fn cpu_seconds() -> f64 {
-    let own = clock_gettime(ClockId::ProcessCPUTime);
-    let own = own.tv_sec as f64 + own.tv_nsec as f64 * 1e-9;
-    own + seconds_in_fields("/proc/self/stat", CUTIME)
+    let time = clock_gettime(ClockId::ProcessCPUTime);
+    let time = time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9;
+    time + seconds_in_fields("/proc/self/stat", CUTIME)
 }
 
 /// CPU time in seconds of another process without its children, with a resolution of 10 ms; 0 if the process does not
@@ -81,8 +81,8 @@ mod tests {
             sum += f64::from(number).sqrt();
         }
         assert!(sum > 0.0);
-        let (all, own) = (cpu_seconds(), cpu_seconds_of(std::process::id()));
-        assert!(own <= all + 0.02 && own > 0.0, "{own} of {all}");
+        let (all, process) = (cpu_seconds(), cpu_seconds_of(std::process::id()));
+        assert!(process <= all + 0.02 && process > 0.0, "{process} of {all}");
         let big = std::hint::black_box(vec![1u8; 64 << 20]);
         assert!(peak_rss_bytes() > big.len() as u64);
     }

@@ -15,13 +15,13 @@ use reconstruction::operator::SensingOperator;
 /// Largest frame value, in units of the white level or of the largest value after one projection.
 ///
 /// The first projection of GAP returns `C y / (H H^T)`. Later ones correct it by less, but the accelerated residual
-/// may wind up, and networks overshoot: the largest value seen is 9 times the white level. The margin of 100 keeps
-/// every tile that a solver can produce.
+/// may wind up, and networks overshoot. The largest value in tests was 9 times the white level; the limit is about 100
+/// times that, so it accepts every tile that a solver can produce.
 const MARGIN: f32 = 1000.0;
 
-/// Why the frames of a tile can't be used.
+/// The reason why the frames of a tile are rejected.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // the messages say it
+#[allow(missing_docs)] // the messages describe the variants
 pub enum Unfit {
     #[error("the frames are {found}, but the tile needs {expected}")]
     Shape { found: String, expected: String },
@@ -38,7 +38,7 @@ pub enum Unfit {
 }
 
 impl Unfit {
-    /// True if the frames are to blame, false if this machine or its arrays are.
+    /// True if the frames are invalid. False if this machine or its arrays are the cause.
     pub fn is_of_frames(&self) -> bool {
         match self {
             Self::Shape { .. } | Self::Value { .. } | Self::Unsolved { .. } => true,
@@ -84,7 +84,7 @@ pub fn verify(path: &Path, input: &TileInput) -> Result<f32, Unfit> {
         }
     };
     if largest == 0.0 {
-        // Without light nothing is summed up, and every frame is 0.
+        // Without light, the residual does not read the frames, so this does. All must be 0.
         (0..expected[0]).try_for_each(|frame| checked(frame).map(|_| ()))?;
     }
     residual(input.masks.view(), input.y.view(), &input.pieces, checked)

@@ -1,4 +1,4 @@
-//! How a worker gets a task, with all that it needs to do it.
+//! Claiming a task, with its inputs.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -12,10 +12,11 @@ use crate::Store;
 use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::calibrations::Calibration;
+use crate::tables::jobs;
 use crate::tables::measurements::Measurement;
 use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
-use crate::tables::{jobs, workers};
+use crate::tables::workers::{self, WorkerTakes};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Sha256, Submission, TaskKind,
     TaskStage, TaskState, ThingId, Timestamp, WorkerId,
@@ -51,9 +52,9 @@ pub struct JobTask {
     pub spec: JobSpec,
     pub calibration: Calibration,
     pub measurement: Measurement,
-    /// What the job's prepare task recorded; none for that task itself.
+    /// Record of the job's prepare task; `None` for that task.
     pub prepared: Option<Value>,
-    /// What its pilot recorded, if it has one that is done.
+    /// Record of its pilot, if it has one that is done.
     pub pilot: Option<Value>,
     /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan.
     pub tiles: Vec<TileResult>,
@@ -73,9 +74,9 @@ pub struct CheckTask {
 #[derive(Debug, Clone)]
 pub struct CalibrationTask {
     pub calibration: CalibrationId,
-    /// Captures, of which masks are to be made; none where only a report on the masks is.
+    /// Captures to compute masks from; `None` if only a report on existing masks is wanted.
     pub captures: Option<Captures>,
-    /// The masks, a planar array, if they are there.
+    /// The masks, a planar array, if they exist.
     pub masks: Option<Sha256>,
 }
 
@@ -85,13 +86,13 @@ pub struct MovieWork {
     pub job: JobId,
     pub spec: JobSpec,
     pub measurement: Measurement,
-    /// What the job's prepare task recorded.
+    /// Record of the job's prepare task.
     pub prepared: Option<Value>,
-    /// Of each snapshot the array with its frames, and the hash that it should have.
+    /// The array with the frames of each snapshot, and its recorded hash.
     pub arrays: Vec<(PathBuf, Sha256)>,
 }
 
-/// Who asks for a task, and so which tasks may be handed out.
+/// The claimant of a task, which decides what it may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Claimant<'a> {
     /// A worker of this machine that does all there is.
@@ -106,92 +107,116 @@ pub enum Claimant<'a> {
     Pool(&'a str),
 }
 
-/// The statement that tells whether there may be work: a task that is ready, or a lease that has run out.
-/// Places: now, [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
+/// The statement that looks for work: a task that is ready, or a lease that has expired. Parameters: now,
+/// [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
 macro_rules! look_text {
     ($kinds:expr, $by_lab:literal) => {
-        concat!(
-            "SELECT 1 WHERE EXISTS (SELECT 1 FROM tasks ",
+        look_text!(@ concat!(
+            "EXISTS (SELECT 1 FROM tasks INDEXED BY ",
             $by_lab,
             " WHERE state = 'ready' ",
             $kinds,
-            " AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
-                 OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
+            " AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)"))
+    };
+    // The tasks of things, and those of jobs that have begun.
+    ($kinds:expr, $by_lab:literal, $by_job:literal) => {
+        look_text!(@ concat!(
+            "EXISTS (SELECT 1 FROM tasks INDEXED BY ",
+            $by_lab,
+            " WHERE state = 'ready' ",
+            $kinds,
+            " AND job IS NULL AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)
+             OR EXISTS (SELECT 1 FROM jobs CROSS JOIN tasks INDEXED BY ",
+            $by_job,
+            " ON job = jobs.id
+                        WHERE jobs.state = 'running' AND tasks.state = 'ready' ",
+            $kinds,
+            " AND job IS NOT NULL AND ready_at NOT BETWEEN ?1 + 1 AND ?1 + ?2)"))
+    };
+    (@ $ready:expr) => {
+        concat!(
+            "SELECT 1 WHERE ",
+            $ready,
+            " OR EXISTS (SELECT 1 FROM tasks WHERE state = 'running'
                                 AND lease_until NOT BETWEEN ?1 AND ?1 + ?3)"
         )
     };
 }
 
 /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of the
-/// lab whose turn it is, of the jobs that have begun before others, of the oldest one. Places: see [`take`].
+/// lab whose turn it is, of movies before jobs, of the jobs that have begun before others, of the oldest one.
+/// Parameters: see [`take`].
 macro_rules! take_text {
-    ($kinds:expr, $by_lab:literal, $by_job:literal) => {
+    ($kinds:expr, $of_lab:literal, $by_lab:literal, $by_job:literal) => {
         take_text!(@
             concat!("state = 'ready' ", $kinds, " AND ready_at NOT BETWEEN ?5 + 1 AND ?5 + ?6"),
-            $by_lab, $by_job)
+            $of_lab, $by_lab, $by_job)
     };
-    (@ $ready:expr, $by_lab:literal, $by_job:literal) => {
+    (@ $ready:expr, $of_lab:literal, $by_lab:literal, $by_job:literal) => {
         concat!(
             "UPDATE tasks SET state = ?1, worker = ?2, lease_until = ?3, attempt = attempt + 1,
                  stage = ?4, iterations = 0, passes = 0, fraction = 0, history = NULL
              WHERE id = (
                  SELECT tasks.id FROM (
                      -- Of each lab its oldest task, and that of the oldest of its jobs that have begun.
-                     SELECT finish, (SELECT id FROM tasks ", $by_lab, "
-                                     WHERE ", $ready, " AND tasks.lab = labs.lab
+                     SELECT finish, (SELECT id FROM tasks INDEXED BY ", $by_lab, "
+                                     WHERE ", $ready, $of_lab, " AND tasks.lab = labs.lab
                                      ORDER BY priority DESC, job, ordinal, id LIMIT 1) AS task
                      FROM labs
                      UNION ALL
-                     SELECT finish, (SELECT id FROM tasks ", $by_job, "
-                                     WHERE ", $ready, "
+                     SELECT finish, (SELECT id FROM tasks INDEXED BY ", $by_job, "
+                                     WHERE ", $ready, " AND job IS NOT NULL
                                        AND job = (SELECT id FROM jobs
                                                   WHERE jobs.state = 'running' AND jobs.lab = labs.lab
-                                                    AND EXISTS (SELECT 1 FROM tasks ", $by_job, "
-                                                                WHERE job = jobs.id AND ", $ready, ")
+                                                    AND EXISTS (SELECT 1 FROM tasks INDEXED BY ", $by_job, "
+                                                                WHERE job = jobs.id AND job IS NOT NULL
+                                                                  AND ", $ready, ")
                                                   ORDER BY priority DESC, id LIMIT 1)
                                      ORDER BY ordinal LIMIT 1)
                      FROM labs)
                  JOIN tasks ON tasks.id = task
                  LEFT JOIN jobs ON jobs.id = job
                  ORDER BY tasks.priority DESC, max(finish, (SELECT max(start) FROM labs)),
-                     jobs.state = 'running' DESC, job, ordinal, tasks.id
+                     job IS NULL DESC, jobs.state = 'running' DESC, job, ordinal, tasks.id
                  LIMIT 1)
              RETURNING id, job, thing, lab, kind, snapshot, snapshots, tile, attempt, cost"
         )
     };
 }
 
-/// The condition for tasks of the light worker: short ones, of jobs that have begun.
-macro_rules! light {
-    () => {
-        "AND light = 1 AND (job IS NULL OR EXISTS
-             (SELECT 1 FROM jobs WHERE id = tasks.job AND state = 'running'))"
-    };
-}
-
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
+    /// The tasks that a worker with these rights takes.
+    pub fn takes(self) -> WorkerTakes {
+        match self {
+            Self::Local | Self::Pool(_) => WorkerTakes::All,
+            Self::WithoutTiles => WorkerTakes::WithoutTiles,
+            Self::Light => WorkerTakes::ShortTasks,
+        }
+    }
+
     fn look(self) -> &'static str {
         match self {
-            Self::Local => look_text!("", ""),
-            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "INDEXED BY tasks_others"),
-            Self::Light => look_text!(light!(), "INDEXED BY tasks_light"),
-            Self::Pool(_) => look_text!("AND kind = 'tile'", ""),
+            Self::Local => look_text!("", "tasks_ready"),
+            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "tasks_others"),
+            Self::Light => look_text!("AND light = 1", "tasks_light", "tasks_light_of_job"),
+            Self::Pool(_) => look_text!("AND kind = 'tile'", "tasks_tiles"),
         }
     }
 
     fn take(self) -> &'static str {
         match self {
-            Self::Local => take_text!("", "", ""),
-            Self::WithoutTiles => take_text!(
-                "AND kind <> 'tile'",
-                "INDEXED BY tasks_others",
-                "INDEXED BY tasks_others_of_job"
-            ),
-            Self::Light => {
-                take_text!(light!(), "INDEXED BY tasks_light", "INDEXED BY tasks_light_of_job")
+            Self::Local => take_text!("", "", "tasks_ready", "tasks_ready_of_job"),
+            Self::WithoutTiles => {
+                take_text!("AND kind <> 'tile'", "", "tasks_others", "tasks_others_of_job")
             }
-            Self::Pool(_) => take_text!("AND kind = 'tile'", "", ""),
+            // It begins no job.
+            Self::Light => {
+                take_text!("AND light = 1", " AND job IS NULL", "tasks_light", "tasks_light_of_job")
+            }
+            Self::Pool(_) => {
+                take_text!("AND kind = 'tile'", "", "tasks_tiles", "tasks_tiles_of_job")
+            }
         }
     }
 }
@@ -416,7 +441,10 @@ mod tests {
         let store = Store::open(folder.path(), purpose).await.unwrap();
         // The look for leases that have run out reads what runs.
         let (no_tiles, light) = (Claimant::WithoutTiles, Claimant::Light);
+        let pool = Claimant::Pool("gpu");
         for (text, index, others) in [
+            (pool.look(), "INDEX tasks_tiles", 1),
+            (pool.take(), "INDEX tasks_tiles", 0),
             (no_tiles.look(), "INDEX tasks_others", 1),
             (no_tiles.take(), "INDEX tasks_others", 0),
             (light.look(), "INDEX tasks_light", 1),

@@ -1,4 +1,4 @@
-//! How a task ends well: what it has made is stored, and what waited for it goes on.
+//! Completion of a task: its result is stored, and the tasks that waited for it become ready.
 
 use serde::Deserialize;
 use serde_json::Value;
@@ -12,8 +12,9 @@ use crate::staging::{StagedBlob, StagedDir};
 use crate::tables::blobs::Origin;
 use crate::tables::calibrations::{self, NewCalibration};
 use crate::tables::measurements::{self, NewMeasurement};
+use crate::tables::reservations::reservations;
 use crate::tables::tasks::Owner;
-use crate::tables::{models, partials, quota, reports, requests, results, sums};
+use crate::tables::{models, quota, reports, requests, results, sums};
 use crate::{Store, dir, on_files};
 use engine::intake::Refusal;
 use engine::job::{
@@ -25,7 +26,7 @@ use engine::job::{
 pub struct Completion {
     /// Where the solver stood when it stopped: `fraction` is below 1 if it converged early.
     pub progress: TaskProgress,
-    /// What is to be remembered of it, for the manifest.
+    /// The task's record, for the manifest.
     pub record: Value,
     pub product: Product,
 }
@@ -117,7 +118,12 @@ impl Store {
             job::settle(&mut transaction, job).await?;
             sums::recount(&mut transaction, job).await?;
         }
-        transaction.commit().await?;
+        // The end of a job removes its tiles.
+        if kind == TaskKind::Manifest {
+            self.commit_removals(transaction).await?;
+        } else {
+            transaction.commit().await?;
+        }
         Ok(Heartbeat::Continue)
     }
 
@@ -173,8 +179,8 @@ impl Store {
     }
 
     /// Reserves `bytes` for the result of a check. The disk must have room for `copies` of them above `min_free`.
-    /// Errors: [`StoreError::Quota`]; [`StoreError::NoRoom`]; [`StoreError::Interrupted`] if the task is not the
-    /// worker's any more.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NoRoom`]; [`StoreError::NoShare`]; [`StoreError::Interrupted`] if
+    /// the worker has lost the task.
     pub async fn promise(
         &self,
         lease: &Lease,
@@ -189,13 +195,13 @@ impl Store {
         requests::promise(&mut transaction, id, 0).await?;
         let request = requests::find(&mut transaction, id).await?;
         quota::check(&mut transaction, &request.lab, request.token, bytes).await?;
-        let promised = partials::promised(&mut transaction).await?;
-        self.dir().check_room("the upload", copies * bytes, promised, min_free)?;
+        let reserved = reservations(&mut transaction).await?.seen_by(&request.lab);
+        self.dir().check_room("the upload", copies * bytes, reserved, min_free)?;
         requests::promise(&mut transaction, id, bytes).await?;
         Ok(transaction.commit().await?)
     }
 
-    /// Writes what was made for a calibration; its captures are needed no more.
+    /// Writes the masks and the report of a calibration; its captures are no longer needed.
     async fn calibrated(
         &self,
         transaction: &mut SqliteConnection,
@@ -249,13 +255,16 @@ async fn finish(
     .execute(&mut *connection)
     .await?;
     sql!(
-        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost,
+             onnxruntime)
              SELECT kind, 1, coalesce(seconds, 0), iterations, passes, coalesce(seconds, 0),
-                 iif(kind = 'tile', cost * fraction, cost) FROM tasks WHERE id = ?
+                 iif(kind = 'tile', cost * fraction, cost), record ->> '$.onnxruntime'
+             FROM tasks WHERE id = ?
          ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
              iterations = iterations + excluded.iterations, passes = passes + excluded.passes,
              recent_seconds = 0.97 * recent_seconds + excluded.recent_seconds,
-             recent_cost = 0.97 * recent_cost + excluded.recent_cost",
+             recent_cost = 0.97 * recent_cost + excluded.recent_cost,
+             onnxruntime = coalesce(excluded.onnxruntime, onnxruntime)",
         [lease.task]
     )
     .execute(&mut *connection)

@@ -1,43 +1,156 @@
-//! The order in which waiting jobs are served, and what that means in seconds.
+//! Forecast of the queue: the order in which jobs are served, and their waiting times.
 //!
-//! A task of a higher priority goes first. At the same priority labs take turns by their shares, and a
-//! lab's jobs go one after the other: when the lab of a job has been served `w` CPU-seconds, another
-//! lab has been served `w` times the ratio of their shares, or all that it wanted.
+//! A task of a higher priority goes first. At equal priority, labs take turns by their shares, and the jobs of a lab
+//! follow each other. When a lab has been served `w` CPU-seconds, another lab has been served `w` times the ratio of
+//! their shares, or all that it wanted.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use engine::job::JobId;
+use crate::Store;
+use crate::columns::{Columns, sql, sql_as};
+use crate::error::Result;
+use engine::job::{JobId, JobState, Lab};
+
+/// Workers that were silent for longer do not count.
+const WORKER_AGE: Duration = Duration::from_secs(15);
 
 /// A forecast is good for so long for each job in it, about twenty times as long as it takes to make: it
 /// costs a twentieth of a core, however many ask.
 const KEPT_PER_JOB: Duration = Duration::from_micros(50);
 const KEPT_AT_MOST: Duration = Duration::from_secs(1);
+/// Number of unfinished jobs above which callers get an outdated forecast while a new one is made. A forecast of 500
+/// jobs takes about a millisecond.
+const LONG: usize = 500;
+/// A forecast that was due so long ago helps nobody: callers wait for a new one.
+const OUTDATED: Duration = Duration::from_secs(30);
 
-/// What is ahead of every unfinished job.
+/// The last forecast of a store, and the making of the next one.
+#[derive(Debug, Default)]
+pub struct Forecasts {
+    last: Mutex<Option<Arc<Forecast>>>,
+    /// Held while a forecast is made.
+    making: Arc<tokio::sync::Mutex<()>>,
+}
+
+impl Forecasts {
+    fn last(&self) -> Option<Arc<Forecast>> {
+        self.last.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    async fn renew(&self, store: &Store) -> Result<Arc<Forecast>> {
+        let made = Arc::new(store.new_forecast().await?);
+        *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Some(made.clone());
+        Ok(made)
+    }
+}
+
+impl Store {
+    /// The load ahead of every unfinished job. While the forecast of a long queue is renewed, callers get the last one,
+    /// so that no request takes longer in a longer queue.
+    pub(super) async fn forecast(&self) -> Result<Arc<Forecast>> {
+        match self.forecasts.last() {
+            Some(last) if last.is_good() => return Ok(last),
+            Some(last) if last.jobs.len() > LONG && !last.is_outdated() => {
+                if let Ok(making) = self.forecasts.making.clone().try_lock_owned() {
+                    let store = self.clone();
+                    tokio::spawn(async move {
+                        let _making = making;
+                        if let Err(error) = store.forecasts.renew(&store).await {
+                            tracing::warn!(%error, "the forecast of the queue can't be renewed");
+                        }
+                    });
+                }
+                return Ok(last);
+            }
+            _ => {}
+        }
+        let _making = self.forecasts.making.lock().await;
+        match self.forecasts.last() {
+            Some(last) if last.is_good() => Ok(last),
+            _ => self.forecasts.renew(self).await,
+        }
+    }
+
+    async fn new_forecast(&self) -> Result<Forecast> {
+        let rows = sql!(
+            "SELECT id, lab, priority, state, tiles_left + others_left AS left
+             FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
+             WHERE finished_at IS NULL ORDER BY id",
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        let found: Vec<(Lab, f64)> =
+            sql_as!("SELECT lab, share FROM labs").fetch_all(&self.readers).await?;
+        let shares: HashMap<Lab, f64> = found.into_iter().collect();
+        let mut labs: Vec<(Lab, f64)> = Vec::new();
+        let (mut places, mut unfinished) = (HashMap::new(), Vec::with_capacity(rows.len()));
+        for row in &rows {
+            let lab: Lab = row.read("lab")?;
+            let place = *places.entry(lab).or_insert_with_key(|lab| {
+                labs.push((lab.clone(), shares.get(lab).copied().unwrap_or(1.0)));
+                labs.len() - 1
+            });
+            unfinished.push(Unfinished {
+                id: row.read("id")?,
+                lab: place,
+                priority: row.read("priority")?,
+                waits: row.read::<JobState>("state")? == JobState::Queued,
+                left: row.read("left")?,
+            });
+        }
+        let workers = self.live_tile_workers(WORKER_AGE).await?;
+        Ok(Forecast::new(&unfinished, labs, workers, self.rates().await?))
+    }
+
+    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: the mean
+    /// over the last tasks of a kind, weighted by their real cost; 1 before there are any.
+    async fn rates(&self) -> Result<(f64, f64)> {
+        let row = sql!(
+            "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
+                    / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
+                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
+                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
+             FROM totals",
+        )
+        .fetch_one(&self.readers)
+        .await?;
+        let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
+        Ok((rate(row.read("tiles")?), rate(row.read("others")?)))
+    }
+
+    /// Planned CPU-seconds left of the unfinished jobs of each lab that has any.
+    pub async fn cost_left_by_lab(&self) -> Result<HashMap<Lab, f64>> {
+        Ok(self.forecast().await?.left_by_lab.clone())
+    }
+}
+
+/// The load ahead of every unfinished job.
 #[derive(Debug)]
 pub struct Forecast {
     workers: u32,
     /// Seconds that a planned CPU-second of a tile takes.
     rate: f64,
-    /// The same of all other tasks: reading and writing are not as fast as computing is.
+    /// Seconds that a planned CPU-second of any other task takes: reading and writing are slower than computing.
     others_rate: f64,
     jobs: HashMap<JobId, Ahead>,
-    /// What is ahead of a job that was not there yet.
-    of_a_new_one: Ahead,
+    /// The load ahead of a new job.
+    new_job: Ahead,
+    left_by_lab: HashMap<Lab, f64>,
     until: Instant,
 }
 
 /// Planned CPU-seconds that are left of some tasks of a job.
 #[derive(Debug, Clone, Copy)]
 pub struct Left {
-    /// Of all of them.
+    /// Sum over all of them.
     pub(crate) sum: f64,
-    /// Of the one that has most left.
+    /// The largest of them.
     pub(crate) longest: f64,
 }
 
-/// What is served before a job.
+/// The load that is served before a job.
 #[derive(Debug, Clone, Copy)]
 struct Ahead {
     /// Planned CPU-seconds.
@@ -48,19 +161,19 @@ struct Ahead {
 
 /// A job that has not ended.
 #[derive(Debug)]
-pub(super) struct Unfinished {
-    pub(super) id: JobId,
-    pub(super) lab: usize,
-    pub(super) priority: i64,
-    pub(super) waits: bool,
+struct Unfinished {
+    id: JobId,
+    lab: usize,
+    priority: i64,
+    waits: bool,
     /// Planned CPU-seconds that are left of it.
-    pub(super) left: f64,
+    left: f64,
 }
 
 impl Forecast {
-    /// Seconds until a job ends, of whose tiles and other tasks so much is left; none if no worker lives.
-    /// `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge
-    /// about as early as each other.
+    /// Seconds until a job ends, from the work left of its tiles and of its other tasks; `None` without a worker that
+    /// takes tiles. `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge about as
+    /// early as each other.
     pub(crate) fn eta_seconds(
         &self,
         job: JobId,
@@ -81,14 +194,20 @@ impl Forecast {
         self.ahead(job).position
     }
 
-    /// For as many workers, which take these seconds for a planned CPU-second of tiles and of other tasks.
-    pub(super) fn new(
+    /// For as many workers, which take these seconds for a planned CPU-second of tiles and of other tasks. `labs` has
+    /// the name and the share of each lab.
+    fn new(
         unfinished: &[Unfinished],
-        shares: &[f64],
+        labs: Vec<(Lab, f64)>,
         workers: usize,
         (rate, others_rate): (f64, f64),
     ) -> Self {
-        let of_a_new_one = Ahead {
+        let shares: Vec<f64> = labs.iter().map(|(_, share)| *share).collect();
+        let mut left = vec![0.0; labs.len()];
+        for job in unfinished {
+            left[job.lab] += job.left;
+        }
+        let new_job = Ahead {
             cost: unfinished.iter().map(|job| job.left).sum(),
             position: 1 + unfinished.iter().filter(|job| job.waits).count(),
         };
@@ -96,19 +215,24 @@ impl Forecast {
             workers: count(workers),
             rate,
             others_rate,
-            jobs: ahead(unfinished, shares),
-            of_a_new_one,
+            jobs: ahead(unfinished, &shares),
+            new_job,
+            left_by_lab: labs.into_iter().map(|(lab, _)| lab).zip(left).collect(),
             until: Instant::now() + (KEPT_PER_JOB * count(unfinished.len())).min(KEPT_AT_MOST),
         }
     }
 
-    /// False once it should be made anew.
-    pub(super) fn is_good(&self) -> bool {
+    /// False once it should be renewed.
+    fn is_good(&self) -> bool {
         Instant::now() < self.until
     }
 
+    fn is_outdated(&self) -> bool {
+        Instant::now() > self.until + OUTDATED
+    }
+
     fn ahead(&self, job: JobId) -> Ahead {
-        self.jobs.get(&job).copied().unwrap_or(self.of_a_new_one)
+        self.jobs.get(&job).copied().unwrap_or(self.new_job)
     }
 }
 
@@ -116,8 +240,7 @@ fn count(things: usize) -> u32 {
     u32::try_from(things).unwrap_or(u32::MAX)
 }
 
-/// What is ahead of each of these jobs, which stand in the order in which they came, with the shares of
-/// the labs.
+/// The load ahead of each of these jobs, which are in the order of their submission. `shares` are those of the labs.
 fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
     let mut by_priority: BTreeMap<i64, Vec<&Unfinished>> = BTreeMap::new();
     for job in jobs {
@@ -141,7 +264,7 @@ fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
         }
         above += wanted.iter().sum::<f64>();
     }
-    // Who ends first is served first; a job that came earlier stands before an equal one.
+    // The job that ends first is served first; of two equal jobs, the older one.
     found.sort_by(|(a, before_a), (b, before_b)| {
         b.priority.cmp(&a.priority).then((before_a + a.left).total_cmp(&(before_b + b.left)))
     });
@@ -158,7 +281,7 @@ fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
 mod tests {
     use super::{Ahead, JobId, Unfinished, ahead};
 
-    /// Planned seconds ahead of jobs, and their places, from lab, priority and what is left of each.
+    /// Planned seconds ahead of each job and its place, from its lab, its priority and the seconds left of it.
     fn served(jobs: &[(usize, i64, f64)], shares: &[f64]) -> Vec<(f64, usize)> {
         let jobs: Vec<_> = jobs
             .iter()
@@ -176,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn jobs_of_one_lab_wait_for_those_before_them_and_for_urgent_ones() {
+    fn jobs_of_one_lab_wait_for_older_and_for_urgent_jobs() {
         let jobs = [(0, 0, 10.0), (0, 0, 20.0), (0, 5, 3.0)];
         assert_eq!(served(&jobs, &[1.0]), [(3.0, 2), (13.0, 3), (0.0, 1)]);
     }

@@ -12,8 +12,8 @@ use engine::job::{JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState, Thi
 const CHECK_PRIORITY: i32 = 2000;
 /// Above that of every job: people wait for calibrations before they measure.
 const CALIBRATION_PRIORITY: i32 = 1000;
-/// Below that of every job: nobody waits for a reconstruction because somebody wants to look at another.
-const MOVIE_PRIORITY: i32 = -1000;
+/// The priority of most jobs: movies take the turns of their lab, and precede its jobs, which take longer.
+const MOVIE_PRIORITY: i32 = 0;
 
 pub async fn insert(
     connection: &mut SqliteConnection,
@@ -172,8 +172,8 @@ pub(super) async fn unblock(
     Ok(())
 }
 
-/// Drops the results of these snapshots, which are damaged, and has [`restart`] make them again: the tiles
-/// that are not stored any more, the assembly, and the manifest of the job, which tells of all.
+/// Drops the results of these snapshots, which are damaged, so that [`restart`] makes them again: the tiles that are no
+/// longer stored, the assembly, and the manifest of the job.
 pub(super) async fn undo(
     connection: &mut SqliteConnection,
     job: JobId,
@@ -206,8 +206,7 @@ pub(super) async fn undo(
     Ok(())
 }
 
-/// Has the tasks of a job that were given up or cancelled wait again, as at its start. What is done
-/// stays done.
+/// Has the tasks of a job that were given up or cancelled wait again, as at its start. Completed tasks stay completed.
 pub(super) async fn restart(connection: &mut SqliteConnection, job: JobId) -> Result<()> {
     sql!(
         "UPDATE tasks SET failures = 0, losses = 0, starved = 0, ready_at = 0,

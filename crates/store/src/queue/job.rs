@@ -7,12 +7,12 @@ use crate::columns::{Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::jobs::{self, JobChanges};
 use crate::tables::sums;
-use crate::{Store, records};
+use crate::{Store, records, removal};
 use engine::job::{Assessment, IllegalTransition, JobId, JobState, Lab, TaskState};
 
 impl Store {
-    /// Cancels a job: at once if no worker is at it, else as soon as the workers have heard of it.
-    /// Cancelling twice is no error.
+    /// Cancels a job: at once if no worker has a task of it, else with the workers' next heartbeats. Cancelling twice
+    /// is no error.
     /// Errors: [`StoreError::State`] if the job has succeeded or failed.
     pub async fn cancel_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
@@ -61,8 +61,7 @@ impl Store {
         Ok(())
     }
 
-    /// Takes up a failed or cancelled job again, or one of which results are known to be damaged. What is
-    /// done and sound stays done.
+    /// Retries a failed or cancelled job, or one with damaged results. Sound results are kept.
     /// Errors: [`StoreError::State`] if the job has not failed or been cancelled, and nothing is damaged.
     pub async fn retry_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
@@ -78,11 +77,10 @@ impl Store {
         self.drop_movies(&mut transaction, id, None).await?;
         graph::restart(&mut transaction, id).await?;
         sums::recount(&mut transaction, id).await?;
-        transaction.commit().await?;
-        Ok(())
+        self.commit_removals(transaction).await
     }
 
-    /// Deletes a job that has come to its end, with all that it has made.
+    /// Deletes a job that has ended, with its results.
     /// Errors: [`StoreError::NotFinal`] if it still runs or waits.
     pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
@@ -99,14 +97,11 @@ impl Store {
         self.drop_tiles(&mut transaction, id).await?;
         self.drop_movies(&mut transaction, id, None).await?;
         sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
-        // Under the lock and before the commit, so that no row is left whose files are gone for
-        // longer than a crash takes; a second DELETE then removes the row.
-        self.discard(self.dir().results(id), None).await?;
-        transaction.commit().await?;
-        Ok(())
+        removal::note_results(&mut transaction, id).await?;
+        self.commit_removals(transaction).await
     }
 
-    /// Marks a job as succeeded, unless it is being cancelled. Its tiles are needed no more.
+    /// Marks a job as succeeded, unless it is being cancelled, and removes its tiles.
     pub(super) async fn succeed(
         &self,
         transaction: &mut SqliteConnection,
@@ -119,6 +114,7 @@ impl Store {
                 .execute(&mut *transaction)
                 .await?;
             self.drop_tiles(transaction, id).await?;
+            shorten_records(transaction, id).await?;
         }
         Ok(())
     }
@@ -137,6 +133,34 @@ impl Store {
     }
 }
 
+/// Shortens the records of a job that has succeeded. About 16 points of each convergence history remain. The
+/// assessments of tiles go, since the assemblies have read them, and lists of files that `result_files` has, too.
+async fn shorten_records(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
+    sql!(
+        "UPDATE tasks SET record = json_remove(record, '$.assessment'),
+             history = (SELECT json_group_array(json(value)) FROM json_each(history)
+                        WHERE key % (json_array_length(history) / 16 + 1) = 0
+                           OR key = json_array_length(history) - 1)
+         WHERE job = ? AND kind = 'tile'",
+        [id]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!(
+        "UPDATE tasks SET record = json_remove(record, '$.files') WHERE job = ? AND kind = 'assemble'",
+        [id]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!(
+        "DELETE FROM attempts WHERE outcome = 'done' AND task IN (SELECT id FROM tasks WHERE job = ?)",
+        [id]
+    )
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
 /// True if the job's tasks are still to be done.
 pub(super) async fn is_wanted(connection: &mut SqliteConnection, id: JobId) -> Result<bool> {
     Ok(matches!(jobs::state(connection, id).await?, JobState::Queued | JobState::Running))
@@ -147,7 +171,7 @@ pub(super) async fn fail(connection: &mut SqliteConnection, id: JobId, reason: &
     graph::cancel_waiting(connection, id).await
 }
 
-/// Ends a job that was being cancelled, once no worker is at it any more.
+/// Ends a job that was being cancelled, once no worker has a task of it.
 pub(super) async fn settle(connection: &mut SqliteConnection, id: JobId) -> Result<()> {
     if jobs::state(connection, id).await? != JobState::Cancelling {
         return Ok(());

@@ -1,10 +1,9 @@
-//! How a task is held, and how it and its worker are parted other than by success.
+//! Leases of tasks, and all ends of an attempt other than success.
 //!
-//! Two kinds of trouble are counted apart. A *failure* is the task's own doing (an error that the
-//! worker told, a fault that killed it) and a few are enough to give up; so are a few deaths for want of
-//! memory, of which the kernel tells. A *loss* may be anyone's (a
-//! SIGKILL, a power cut, a lease that ran out) and many are borne before the task is held to be the
-//! cause. Both are bounded, so a task that kills its workers comes to an end.
+//! Failures and losses are counted separately. A *failure* is caused by the task: an error that the worker reported, or
+//! a fault that killed it. A few failures are enough to give up, and so are a few kills by the kernel for lack of
+//! memory. A *loss* may have any cause: a SIGKILL, a power cut, an expired lease. Many are tolerated before the task
+//! counts as the cause. Both are bounded, so a task that kills its workers ends.
 
 use std::time::Duration;
 
@@ -24,7 +23,7 @@ use engine::job::{
 
 /// So many failures of a task, and it is given up, and its job or calibration with it.
 pub const MAX_FAILURES: u32 = 3;
-/// So many deaths for want of memory at a task, and it is given up in the same way.
+/// Kills for lack of memory after which a task is given up in the same way.
 pub const MAX_STARVED: u32 = 5;
 /// So many losses of a task, and it is given up in the same way.
 pub const MAX_LOSSES: u32 = 25;
@@ -57,27 +56,27 @@ impl Lease {
 pub enum Heartbeat {
     /// Go on; the lease is renewed.
     Continue,
-    /// The job is not wanted any more: stop, and call [`Store::give_back`].
+    /// The job was cancelled or has failed: stop, and call [`Store::give_back`].
     Cancelled,
     /// The task is someone else's, as the lease ran out, or it was deleted with its calibration: stop,
     /// and drop everything.
     Lost,
 }
 
-/// How a worker came to its end, as far as the one who watched it can tell.
+/// The end of a worker, as its supervisor saw it.
 #[derive(Debug, Clone)]
 pub enum WorkerEnd {
-    /// It ended by itself and gave its task back, if it had one.
+    /// It ended in order and gave its task back, if it had one.
     Left,
     /// It was killed from outside: the task may be innocent.
     Killed,
-    /// The kernel killed it for want of memory, as this text tells: the task is under suspicion.
+    /// The kernel killed it for lack of memory, with this description: the task may be the cause.
     Starved(String),
     /// It died of a fault, such as SIGSEGV or a panic: the task is under suspicion.
     Crashed(String),
 }
 
-/// How a worker and its task were parted.
+/// The end of an attempt other than success.
 #[derive(Debug)]
 pub(super) enum Loss {
     Released,
@@ -85,7 +84,7 @@ pub(super) enum Loss {
     Postponed(String),
     /// The worker was killed or fell silent.
     Lost(String),
-    /// The worker was killed for want of memory.
+    /// The worker was killed for lack of memory.
     Starved(String),
     Crashed(String),
     /// The worker told an error; true if another attempt could do better.
@@ -104,9 +103,8 @@ pub(super) enum Outcome {
 }
 
 impl Store {
-    /// Renews a lease, notes the progress and how the solver went (JSON as
-    /// [`TileHistory::points`](crate::TileHistory) has it; without one, what was noted stays),
-    /// and asks whether to go on.
+    /// Renews a lease, notes the progress and how the solver went (JSON as [`TileHistory::points`](crate::TileHistory)
+    /// has it; without one, the last one stays), and returns whether to continue.
     pub async fn heartbeat(
         &self,
         lease: &Lease,
@@ -148,8 +146,8 @@ impl Store {
         self.part(lease, &Loss::Failed(reason.to_owned(), retryable)).await
     }
 
-    /// Gives a task back that can't be done now, for a reason that is not its own. It is tried again after a
-    /// pause, as often as need be.
+    /// Gives a task back that can't be done now, for a reason that is not its own. It is tried again after a pause,
+    /// without limit.
     pub async fn postpone(&self, lease: &Lease, reason: &str) -> Result<()> {
         self.part(lease, &Loss::Postponed(reason.to_owned())).await
     }
@@ -231,8 +229,8 @@ impl Store {
     }
 }
 
-/// What the task belongs to and its kind, if the lease is still good. A lease that ran out but was not
-/// claimed by anyone else is good: the work is done, so it may as well count.
+/// Owner and kind of the task, if the lease is valid. A lease that ran out but was not claimed by anyone else is good:
+/// the work is done, so it may as well count.
 pub(super) async fn held(
     connection: &mut SqliteConnection,
     lease: &Lease,
@@ -250,8 +248,8 @@ pub(super) async fn held(
 /// Takes back the tasks of workers that have fallen silent.
 pub(super) async fn reap(connection: &mut SqliteConnection, now: i64) -> Result<()> {
     let silent = Loss::Lost("the worker fell silent and its lease ran out".into());
-    let tasks = "SELECT id FROM tasks WHERE state = ? AND lease_until NOT BETWEEN ? AND ?";
-    let tasks = sql_as!(tasks, [TaskState::Running, now, now + LONGEST_LEASE]);
+    let tasks = "SELECT id FROM tasks WHERE state = 'running' AND lease_until NOT BETWEEN ? AND ?";
+    let tasks = sql_as!(tasks, [now, now + LONGEST_LEASE]);
     for task in tasks.fetch_all(&mut *connection).await? {
         lose(connection, task, &silent).await?;
     }

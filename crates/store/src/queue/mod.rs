@@ -17,8 +17,8 @@ mod remote;
 
 pub use claim::{CalibrationTask, CheckTask, Claimant, ClaimedTask, JobTask, MovieWork, Work};
 pub use complete::{CalibrationDone, Checked, Completion, Product};
-pub(super) use forecast::Forecast;
+pub(super) use forecast::Forecasts;
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, WorkerEnd};
 pub use movie::Movie;
-pub use progress::{Estimate, JobMark, JobProgress, ProgressStage};
+pub use progress::{Estimate, JobProgress, ProgressStage};
 pub use remote::{Begun, MessagePlace, RemoteBeat, RemoteTask};

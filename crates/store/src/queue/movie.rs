@@ -10,23 +10,23 @@ use crate::tables::results::WHOLE_JOB;
 use crate::{Job, Store};
 use engine::job::{JobId, Sha256, TaskKind, TaskState};
 
-/// Where the movie of a snapshot, or of all of a job, stands.
+/// State of the movie of a snapshot, or of a whole job.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Movie {
     Ready {
         sha256: Sha256,
         size: u64,
     },
-    /// A worker is at it, so far (on \[0,1\]); none before one is.
+    /// The share that is done, on \[0,1\]; `None` until a worker has begun.
     Asked(Option<f64>),
-    /// It could not be made, for this reason; who asks again has it tried again.
+    /// It failed, for this reason; the next request tries again.
     Failed(String),
 }
 
 impl Store {
     /// Finds the movie of a snapshot of a job (or, with none, of all), or asks for it if nobody has, or if it is
     /// damaged. The frames must be there.
-    /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if the job is gone.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if the job was deleted.
     pub async fn movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
         let place = place(snapshot);
         let found = sql!(FIND, [job.id, place]).fetch_optional(&self.readers).await?;
@@ -47,7 +47,7 @@ impl Store {
         self.ask_movie(job, snapshot).await
     }
 
-    /// Asks for a movie anew, or tells why the last one failed.
+    /// Requests a movie, or reports why the last attempt failed.
     async fn ask_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
         let place = place(snapshot);
         let mut transaction = self.write().await?;
@@ -60,7 +60,7 @@ impl Store {
         .await?;
         self.drop_movies(&mut transaction, job.id, Some(place)).await?;
         if let Some(reason) = failed {
-            transaction.commit().await?;
+            self.commit_removals(transaction).await?;
             return Ok(Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into())));
         }
         quota::check(&mut transaction, &job.lab, None, job.spec.movie_bytes(snapshot)).await?;
@@ -69,7 +69,7 @@ impl Store {
         known.ok_or_else(|| StoreError::missing("job", job.id))?;
         let (kind, cost) = (TaskKind::Movie { snapshot }, job.spec.movie_cost(snapshot));
         graph::insert_for(&mut transaction, (&job.lab, job.id.into()), kind, cost).await?;
-        transaction.commit().await?;
+        self.commit_removals(transaction).await?;
         Ok(Movie::Asked(None))
     }
 

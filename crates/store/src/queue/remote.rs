@@ -1,8 +1,8 @@
 //! Tiles that are out with workers on other machines, as the hub of the cluster accounts for them.
 //!
-//! A tile goes out as one message, which may be delivered to several workers one after the other, when
-//! the first ones fall silent. Each delivery that a worker begins with is an attempt of its own. No
-//! lease runs out here: the message server finds the silent ones.
+//! A tile goes out as one message, which may be delivered to several workers one after the other, when the first ones
+//! fall silent. Each delivery that a worker begins with is a separate attempt. No lease runs out here: the message
+//! server finds the silent ones.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -36,7 +36,7 @@ pub struct RemoteTask {
     pub place: Option<MessagePlace>,
     /// The last delivery that a worker has begun with; 0 for none.
     pub delivery: u32,
-    /// Who has it; before that, who handed it out.
+    /// The worker that has it; before that, the hub.
     pub worker: WorkerId,
     /// When that attempt began.
     pub started_at: Timestamp,
@@ -44,8 +44,8 @@ pub struct RemoteTask {
     pub wanted: bool,
 }
 
-/// Where a message is: which stream, by the time at which it was made (a disk may be lost, and the
-/// stream made anew), and its number there.
+/// Place of a message: its stream, named by the time of its creation (a lost disk means a new stream), and its number
+/// there.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MessagePlace {
     pub stream: String,
@@ -72,16 +72,16 @@ pub enum Begun {
     Lost,
 }
 
-/// What a worker tells of its tile.
+/// A worker's report on its tile.
 #[derive(Debug, Clone)]
 pub struct RemoteBeat {
     pub task: TaskId,
     pub attempt: u32,
     pub worker: WorkerId,
-    /// The pool of the worker that tells it.
+    /// The pool of the worker that reports.
     pub pool: String,
     pub progress: TaskProgress,
-    /// How the solver went, if there is news.
+    /// Convergence history, if it has changed.
     pub history: Option<String>,
 }
 
@@ -129,7 +129,7 @@ impl Store {
         found.fetch_optional(&self.readers).await
     }
 
-    /// Those of these jobs that are not wanted any more.
+    /// The jobs among these that neither wait nor run.
     pub async fn unwanted_jobs(&self, jobs: &[JobId]) -> Result<Vec<JobId>, StoreError> {
         if jobs.is_empty() {
             return Ok(Vec::new());
@@ -151,7 +151,7 @@ impl Store {
         Ok(counts.into_iter().collect())
     }
 
-    /// All that a tile that is out needs, once more.
+    /// The inputs of a tile that is out, to publish them again.
     pub async fn remote_work(&self, remote: &RemoteTask) -> Result<ClaimedTask, StoreError> {
         let row = sql!(
             "SELECT job, thing, kind, snapshot, snapshots, tile, cost FROM tasks WHERE id = ?",
@@ -311,7 +311,7 @@ impl Store {
         Ok(())
     }
 
-    /// Forgets a worker on another machine that has said goodbye.
+    /// Removes a worker on another machine that has left.
     pub async fn remote_worker_left(&self, id: WorkerId) -> Result<(), StoreError> {
         workers::remove(&mut *self.writer.acquire().await?, id).await
     }

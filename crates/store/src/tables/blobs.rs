@@ -9,7 +9,7 @@ use crate::error::{Result, StoreError};
 use crate::rows::Page;
 use crate::staging::StagedBlob;
 use crate::tables::quota;
-use crate::{Store, on_files};
+use crate::{Store, on_files, removal};
 use engine::job::{Lab, Sha256, Timestamp, TokenId};
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -45,7 +45,7 @@ macro_rules! in_use {
     };
 }
 
-/// Where a file comes from.
+/// Origin of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 #[strum(serialize_all = "snake_case")]
 pub enum Origin {
@@ -105,7 +105,7 @@ impl Store {
         held(&mut connection, lab, sha256).await?.ok_or_else(|| StoreError::missing("blob", sha256))
     }
 
-    /// A page of the lab's uploads, newest first, after the one that `after` tells of.
+    /// A page of the lab's uploads, newest first. `after` has the time and the hash of the last one of the page before.
     pub async fn uploads(
         &self,
         lab: &Lab,
@@ -148,8 +148,7 @@ impl Store {
             .execute(&mut *transaction)
             .await?;
         self.release(&mut transaction, sha256).await?;
-        transaction.commit().await?;
-        Ok(())
+        self.commit_removals(transaction).await
     }
 
     /// Puts a file in its place and writes its row, in one step for all other processes.
@@ -178,7 +177,8 @@ impl Store {
         Ok(())
     }
 
-    /// Removes a derived file if nothing refers to it any more. Uploads are left to [`Self::collect`].
+    /// Deletes the row of a derived file if nothing refers to it. Uploads are left to [`Self::collect`]. The
+    /// transaction must end with [`Self::commit_removals`].
     pub(crate) async fn release(
         &self,
         transaction: &mut SqliteConnection,
@@ -195,11 +195,12 @@ impl Store {
              RETURNING created_at",
             [sha256]
         )
-        .fetch_optional(transaction)
+        .fetch_optional(&mut *transaction)
         .await?;
-        let Some(created_at) = removed else { return Ok(()) };
-        // Before the commit: after it, another process could put the same content in place.
-        self.discard(self.dir().blob(&sha256), Some(created_at)).await
+        match removed {
+            Some(created_at) => removal::note_blob(transaction, sha256, created_at).await,
+            None => Ok(()),
+        }
     }
 
     /// Removes the uploads that nothing refers to and nobody has sent since `before`, and requests from before that
@@ -228,15 +229,15 @@ impl Store {
         );
         let removed: Vec<(Sha256, Timestamp)> = removed.fetch_all(&mut *transaction).await?;
         for (sha256, created_at) in &removed {
-            self.discard(self.dir().blob(sha256), Some(*created_at)).await?;
+            removal::note_blob(&mut transaction, *sha256, *created_at).await?;
         }
-        transaction.commit().await?;
+        self.commit_removals(transaction).await?;
         Ok(removed.len())
     }
 
     /// Number and bytes of all stored files.
     pub async fn blob_totals(&self) -> Result<(u64, u64)> {
-        let totals = "SELECT count(*), coalesce(sum(size), 0) FROM blobs";
+        let totals = "SELECT coalesce(sum(files), 0), coalesce(sum(bytes), 0) FROM stored_files";
         sql_as!(totals).fetch_one(&self.readers).await
     }
 }

@@ -1,4 +1,4 @@
-//! Table `calibrations`: masks that are there.
+//! Table `calibrations`: calibrations with masks.
 
 use serde::Serialize;
 use sqlx::SqliteConnection;
@@ -12,7 +12,7 @@ use crate::tables::keys::Made;
 use crate::tables::requests::{self, Asked};
 use engine::job::{CalibrationId, Lab, Label, Mosaic, Sha256, Timestamp, TokenId};
 
-/// What is known of a calibration when its masks have been checked.
+/// Facts of a calibration whose masks have passed their check.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NewCalibration {
     pub name: Option<Label>,
@@ -27,7 +27,7 @@ pub struct NewCalibration {
     pub full_scale: f32,
     /// Mean of all mask values on [0, 1].
     pub mask_mean: f64,
-    /// Pixels that are dark in all frames, of which nothing can be known.
+    /// Pixels that are dark in all frames. They carry no information.
     pub dead_pixels: u64,
     /// Values below 0, set to 0.
     pub clipped_negatives: u64,
@@ -99,7 +99,7 @@ impl Store {
         }
     }
 
-    /// As [`Self::calibration`]; without a lab, for those who work for all of them.
+    /// As [`Self::calibration`]; without a lab, for workers, which serve all labs.
     pub(crate) async fn find_calibration(
         &self,
         lab: Option<&Lab>,
@@ -156,8 +156,7 @@ impl Store {
         if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
             self.release(&mut transaction, prepared).await?;
         }
-        transaction.commit().await?;
-        Ok(())
+        self.commit_removals(transaction).await
     }
 }
 
@@ -180,7 +179,7 @@ pub async fn insert_made(
     requests::fulfil(connection, id.into()).await
 }
 
-/// Writes the row of a calibration whose masks are there.
+/// Writes the row of a calibration that has masks.
 async fn insert(
     connection: &mut SqliteConnection,
     (lab, token): (&Lab, Option<TokenId>),

@@ -1,4 +1,4 @@
-//! Table `jobs`. What becomes of a job is the queue's business.
+//! Table `jobs`. The queue changes their states.
 
 use sqlx::SqliteConnection;
 
@@ -21,7 +21,7 @@ pub struct Job {
     /// When its first task was claimed.
     pub started_at: Option<Timestamp>,
     pub finished_at: Option<Timestamp>,
-    /// How good its frames are expected to be; none until they are there, and where nothing can be told.
+    /// Predicted quality of its frames; `None` before the job has succeeded, and where no prediction exists.
     pub assessment: Option<Assessment>,
 }
 
@@ -51,27 +51,30 @@ pub struct JobFilter {
     pub after: Option<JobId>,
 }
 
-/// What a user changes of a job.
+/// Changes of a job by a user.
 #[derive(Debug, Clone, Default)]
 pub struct JobChanges {
-    /// The new label, or none any more.
+    /// The new label; `Some(None)` removes it.
     pub label: Option<Option<Label>>,
     pub priority: Option<i32>,
 }
 
-/// The list of jobs that meet the condition `$whose`.
+/// The list of jobs that meet the condition `$whose`, for which there is an index. Identifiers are below 'g', since
+/// they are hexadecimal.
 macro_rules! list_text {
-    ($whose:literal) => {
+    ($index:literal, $whose:literal) => {
         concat!(
-            "SELECT * FROM jobs
-             WHERE (?1 IS NULL OR id < ?1) AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
+            "SELECT * FROM jobs WHERE id IN (SELECT id FROM jobs INDEXED BY ",
+            $index,
+            " WHERE id < coalesce(?1, 'g') AND (?2 IS NULL OR state IN (SELECT value FROM json_each(?2)))
                AND (?3 IS NULL OR calibration = ?3) AND (?4 IS NULL OR measurement = ?4)
                AND (?5 IS NULL OR label = ?5)
-               AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, lower(?6)))
+               AND (?6 IS NULL OR instr(lower(label), lower(?6)) OR instr(id, ?11))
+               AND (?12 IS NULL OR state = ?12)
                AND (?9 IS NULL OR created_at >= ?9) AND (?10 IS NULL OR created_at < ?10)
                AND ",
             $whose,
-            " ORDER BY id DESC LIMIT ?7"
+            " ORDER BY id DESC LIMIT ?7) ORDER BY id DESC"
         )
     };
 }
@@ -82,7 +85,7 @@ impl Store {
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
     }
 
-    /// A job, whosever it is.
+    /// A job of any lab.
     pub async fn job_of_any_lab(&self, id: JobId) -> Result<Job> {
         let job = sql_as!("SELECT * FROM jobs WHERE id = ?", [id]);
         job.fetch_optional(&self.readers).await?.ok_or_else(|| StoreError::missing("job", id))
@@ -95,8 +98,17 @@ impl Store {
         filter: &JobFilter,
         limit: u32,
     ) -> Result<Page<Job>> {
-        // One text for both would not use the index by lab.
-        let text = if lab.is_some() { list_text!("lab = ?8") } else { list_text!("?8 IS NULL") };
+        let state =
+            filter.states.as_ref().filter(|states| states.len() == 1).map(|states| states[0]);
+        // One text for all would use no index.
+        let text = match (lab, state) {
+            (Some(_), Some(_)) => list_text!("jobs_in_state", "lab = ?8 AND state = ?12"),
+            (Some(_), None) => list_text!("jobs_of_lab", "lab = ?8"),
+            (None, _) => list_text!("jobs_of_all", "?8 IS NULL"),
+        };
+        // Identifiers hold no other characters.
+        let in_id = filter.search.as_ref().map(|text| text.as_str().to_lowercase());
+        let in_id = in_id.filter(|text| text.chars().all(|c| c.is_ascii_hexdigit() || c == '-'));
         let items = sql_as!(
             text,
             [
@@ -109,7 +121,9 @@ impl Store {
                 i64::from(limit) + 1,
                 lab,
                 filter.created.from,
-                filter.created.before
+                filter.created.before,
+                in_id,
+                state
             ]
         )
         .fetch_all(&self.readers)
@@ -124,7 +138,7 @@ impl Store {
     }
 
     pub async fn job_counts(&self) -> Result<Vec<(JobState, u64)>> {
-        let counts = "SELECT state, count(*) FROM jobs GROUP BY state";
+        let counts = "SELECT state, sum(jobs) FROM jobs_by_state GROUP BY state";
         sql_as!(counts).fetch_all(&self.readers).await
     }
 }

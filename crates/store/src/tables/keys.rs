@@ -11,7 +11,7 @@ use crate::columns::{sql, sql_as};
 use crate::error::{Result, StoreError};
 use engine::job::{InvalidId, JobId, Lab, Sha256};
 
-/// What a key makes; by these names in the column `what`.
+/// The kind of thing that a key creates, named as in the column `what`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
 #[strum(serialize_all = "lowercase", const_into_str)]
 pub enum Made {

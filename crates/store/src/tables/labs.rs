@@ -14,21 +14,19 @@ use engine::job::{JobState, Lab, Timestamp};
 #[derive(Debug, Clone, PartialEq)]
 pub struct LabRow {
     pub lab: Lab,
-    /// Its share of the machine, beside the shares of the others that want it.
+    /// Its weight when labs compete for the machine.
     pub share: f64,
-    /// Bytes that it may keep here; none: no limit.
+    /// Bytes that it may keep here; none: the default.
     pub max_bytes: Option<u64>,
-    /// Jobs that it may have waiting and running; none: no limit of its own.
+    /// Jobs that it may have waiting and running; none: the default.
     pub max_jobs: Option<u64>,
     /// Jobs that wait and run.
     pub jobs: u64,
-    /// Planned CPU-seconds that are left of them.
-    pub cost_left: f64,
 }
 
-from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs, cost_left });
+from_row!(LabRow, row => { lab, share, max_bytes, max_jobs, jobs });
 
-/// What a lab has here.
+/// Use of the service by a lab.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LabUse {
     /// Uploads, and their bytes.
@@ -57,7 +55,7 @@ pub struct LabFigures {
     pub result_bytes: u64,
 }
 
-/// What a lab is to be entitled to; what is none stays as it is.
+/// New entitlement of a lab; fields that are `None` stay unchanged.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Entitlement {
     /// Above 0.
@@ -72,13 +70,15 @@ impl Store {
     pub async fn lab_use(&self, lab: &Lab) -> Result<LabUse> {
         let found = sql_as!(
             "SELECT
-                 (SELECT count(*) FROM holdings WHERE lab = ?1) AS uploads,
-                 (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                  WHERE lab = ?1) AS upload_bytes,
-                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE lab = ?1)
-                 + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                    WHERE lab = ?1 AND thing IS NOT NULL AND result IS NOT NULL) AS result_bytes,
-                 (SELECT count(*) FROM jobs WHERE lab = ?1 AND finished_at IS NULL) AS jobs",
+                 coalesce((SELECT files FROM files_of_labs WHERE lab = ?1 AND kind = 'upload'), 0)
+                     AS uploads,
+                 coalesce((SELECT bytes FROM files_of_labs WHERE lab = ?1 AND kind = 'upload'), 0)
+                     AS upload_bytes,
+                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs_by_state WHERE lab = ?1)
+                 + coalesce((SELECT bytes FROM files_of_labs WHERE lab = ?1 AND kind = 'movie'), 0)
+                     AS result_bytes,
+                 (SELECT coalesce(sum(jobs), 0) FROM jobs_by_state
+                  WHERE lab = ?1 AND state IN ('queued', 'running', 'cancelling')) AS jobs",
             [lab]
         );
         found.fetch_one(&self.readers).await
@@ -90,7 +90,7 @@ impl Store {
     }
 
     /// The lab of this name.
-    /// Errors: [`StoreError::NotFound`] if none is on record.
+    /// Errors: [`StoreError::NotFound`] if there is none.
     pub async fn lab(&self, name: &str) -> Result<LabRow> {
         let found = self.find_labs(Some(name)).await?.pop();
         found.ok_or_else(|| StoreError::missing("lab", name))
@@ -98,13 +98,11 @@ impl Store {
 
     async fn find_labs(&self, name: Option<&str>) -> Result<Vec<LabRow>> {
         let rows = sql_as!(
-            "SELECT labs.lab, share, max_bytes, max_jobs, count(jobs.id) AS jobs,
-                 coalesce(sum(tiles_left + others_left), 0.0) AS cost_left
-             FROM labs
-             LEFT JOIN jobs ON jobs.lab = labs.lab AND finished_at IS NULL
-             LEFT JOIN job_sums ON job = jobs.id
-             WHERE ?1 IS NULL OR labs.lab = ?1
-             GROUP BY labs.lab ORDER BY labs.lab",
+            "SELECT lab, share, max_bytes, max_jobs,
+                 (SELECT coalesce(sum(jobs), 0) FROM jobs_by_state
+                  WHERE jobs_by_state.lab = labs.lab AND state IN ('queued', 'running', 'cancelling'))
+                     AS jobs
+             FROM labs WHERE ?1 IS NULL OR lab = ?1 ORDER BY lab",
             [name]
         );
         rows.fetch_all(&self.readers).await
@@ -115,9 +113,9 @@ impl Store {
         let rows: Vec<(Lab, u64, f64, f64, u64, Option<Timestamp>)> = sql_as!(
             "SELECT labs.lab, coalesce(jobs_begun, 0), coalesce(wait_seconds, 0.0),
                  coalesce(cpu_seconds, 0.0),
-                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs WHERE jobs.lab = labs.lab)
-                 + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-                    WHERE tasks.lab = labs.lab AND thing IS NOT NULL AND result IS NOT NULL),
+                 (SELECT coalesce(sum(result_bytes), 0) FROM jobs_by_state WHERE jobs_by_state.lab = labs.lab)
+                 + coalesce((SELECT bytes FROM files_of_labs
+                             WHERE files_of_labs.lab = labs.lab AND kind = 'movie'), 0),
                  (SELECT min(created_at) FROM jobs
                   WHERE jobs.lab = labs.lab AND finished_at IS NULL AND started_at IS NULL)
              FROM labs LEFT JOIN lab_totals USING (lab) ORDER BY labs.lab",
@@ -125,9 +123,7 @@ impl Store {
         .fetch_all(&self.readers)
         .await?;
         let counted: Vec<(Lab, JobState, u64)> =
-            sql_as!("SELECT lab, state, count(*) FROM jobs GROUP BY lab, state")
-                .fetch_all(&self.readers)
-                .await?;
+            sql_as!("SELECT lab, state, jobs FROM jobs_by_state").fetch_all(&self.readers).await?;
         let now = Timestamp::now();
         let figures = rows.into_iter().map(|row| {
             let (lab, jobs_begun, wait_seconds, cpu_seconds, result_bytes, oldest) = row;
@@ -148,13 +144,13 @@ impl Store {
         Ok(figures.collect())
     }
 
-    /// Whether a lab is on record: it has a token, something in the queue, or limits.
+    /// True if a lab has a row: it has or had a token, a job, or limits.
     pub async fn knows_lab(&self, lab: &Lab) -> Result<bool> {
         let found = sql!("SELECT 1 FROM labs WHERE lab = ?", [lab]);
         Ok(found.fetch_optional(&self.readers).await?.is_some())
     }
 
-    /// What a lab is entitled to.
+    /// Share and limits of a lab.
     pub async fn entitlement(&self, lab: &Lab) -> Result<Entitlement> {
         let found = sql_as!("SELECT share, max_bytes, max_jobs FROM labs WHERE lab = ?", [lab]);
         let found: Option<(f64, Option<u64>, Option<u64>)> =
@@ -164,7 +160,24 @@ impl Store {
         Ok(Entitlement { share: Some(share), max_bytes, max_jobs })
     }
 
-    /// Sets what a lab is entitled to. A lab that is not on record yet is put there.
+    /// Sets the default limits of labs.
+    pub async fn set_default_limits(&self, max_bytes: u64, max_jobs: u64) -> Result<()> {
+        sql!(
+            "INSERT INTO default_limits VALUES (1, ?, ?) ON CONFLICT (one) DO UPDATE
+             SET max_bytes = excluded.max_bytes, max_jobs = excluded.max_jobs",
+            [max_bytes, max_jobs]
+        )
+        .execute(&self.writer)
+        .await?;
+        Ok(())
+    }
+
+    /// The limits that hold for a lab: bytes and jobs. `None` for no limit.
+    pub async fn limits(&self, lab: &Lab) -> Result<(Option<u64>, Option<u64>)> {
+        limits(&mut *self.readers.acquire().await?, lab).await
+    }
+
+    /// Sets what a lab is entitled to. A new lab gets a row.
     pub async fn entitle(&self, lab: &Lab, to: Entitlement) -> Result<()> {
         let mut transaction = self.write().await?;
         know(&mut transaction, lab).await?;
@@ -187,7 +200,7 @@ impl Store {
     }
 
     /// Takes a lab off the record, with its share, its limits and its totals.
-    /// Errors: [`StoreError::NotFound`] if it is not on record; [`StoreError::InUse`] if it has a token or data.
+    /// Errors: [`StoreError::NotFound`] if it is unknown; [`StoreError::InUse`] if it has a token or data.
     pub async fn remove_lab(&self, lab: &Lab) -> Result<()> {
         let mut transaction = self.write().await?;
         for (by, query) in BELONGINGS {
@@ -201,12 +214,18 @@ impl Store {
         if removed.rows_affected() == 0 {
             return Err(StoreError::missing("lab", lab.as_str()));
         }
-        sql!("DELETE FROM lab_totals WHERE lab = ?", [lab]).execute(&mut *transaction).await?;
+        for totals in [
+            "DELETE FROM lab_totals WHERE lab = ?",
+            "DELETE FROM jobs_by_state WHERE lab = ?",
+            "DELETE FROM files_of_labs WHERE lab = ?",
+        ] {
+            sql!(totals, [lab]).execute(&mut *transaction).await?;
+        }
         Ok(transaction.commit().await?)
     }
 }
 
-/// Things that keep a lab on record, each with the query that counts those of one lab.
+/// Things that keep a lab from being removed, each with the query that counts those of one lab.
 const BELONGINGS: [(&str, &str); 8] = [
     ("tokens", "SELECT count(*) FROM tokens WHERE lab = ? AND revoked_at IS NULL"),
     ("jobs", "SELECT count(*) FROM jobs WHERE lab = ?"),
@@ -221,13 +240,28 @@ const BELONGINGS: [(&str, &str); 8] = [
     ),
 ];
 
-/// What is wrong with a share, if something is.
+/// As [`Store::limits`].
+pub async fn limits(
+    connection: &mut SqliteConnection,
+    lab: &Lab,
+) -> Result<(Option<u64>, Option<u64>)> {
+    let limits = sql_as!(
+        "SELECT coalesce((SELECT max_bytes FROM labs WHERE lab = ?1),
+                         (SELECT max_bytes FROM default_limits WHERE (SELECT count(*) FROM labs) > 1)),
+                coalesce((SELECT max_jobs FROM labs WHERE lab = ?1),
+                         (SELECT max_jobs FROM default_limits WHERE (SELECT count(*) FROM labs) > 1))",
+        [lab]
+    );
+    limits.fetch_one(connection).await
+}
+
+/// The problem of a share, if it has one.
 pub fn share_error(share: f64) -> Option<&'static str> {
     let fits = (0.001..=1000.0).contains(&share);
     (!fits).then_some("a share is a number from 0.001 to 1000")
 }
 
-/// Puts a lab on record, if it is not there.
+/// Inserts the row of a lab, if it is missing.
 pub async fn know(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
     sql!("INSERT OR IGNORE INTO labs (lab) VALUES (?)", [lab]).execute(connection).await?;
     Ok(())

@@ -14,7 +14,7 @@ use engine::job::{
     CalibrationId, Finding, Lab, Label, MeasurementId, Sequence, Sha256, Timestamp, TokenId,
 };
 
-/// What is known of a measurement when it has been checked.
+/// Facts of a measurement that has passed its check.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NewMeasurement {
     pub name: Option<Label>,
@@ -33,11 +33,11 @@ pub struct NewMeasurement {
     pub camera_fps: Option<f64>,
     /// Exposure of one snapshot in seconds.
     pub exposure_s: Option<f64>,
-    /// Whether the snapshots follow one another without a gap.
+    /// `contiguous` if the snapshots follow each other without a gap.
     pub sequence: Sequence,
     /// The uploads whose average was subtracted.
     pub dark: Vec<Sha256>,
-    /// What the check against the calibration found.
+    /// Findings of the check against the calibration.
     pub warnings: Vec<Finding>,
 }
 
@@ -82,7 +82,7 @@ impl Store {
         }
     }
 
-    /// As [`Self::measurement`]; without a lab, for those who work for all of them.
+    /// As [`Self::measurement`]; without a lab, for workers, which serve all labs.
     pub(crate) async fn find_measurement(
         &self,
         lab: Option<&Lab>,
@@ -137,7 +137,7 @@ impl Store {
         if let Some(prepared) = prepared.fetch_optional(&mut *transaction).await? {
             self.release(&mut transaction, prepared).await?;
         }
-        Ok(transaction.commit().await?)
+        self.commit_removals(transaction).await
     }
 }
 

@@ -1,7 +1,8 @@
-//! The tables: one file for each kind of thing on record.
+//! The tables: one file for each kind of row.
 
 pub(super) mod blobs;
 pub(super) mod calibrations;
+mod changes;
 pub(super) mod jobs;
 pub(super) mod keys;
 pub(super) mod labs;
@@ -11,21 +12,25 @@ pub(super) mod partials;
 pub(super) mod quota;
 pub(super) mod reports;
 pub(super) mod requests;
+pub(super) mod reservations;
 pub(super) mod results;
 pub(super) mod sums;
 pub(super) mod tasks;
 mod tokens;
+mod totals;
 pub(super) mod workers;
 
 pub use blobs::{Blob, BlobRow, Origin};
 pub use calibrations::{Calibration, NewCalibration};
+pub use changes::{Change, Changes};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
 pub use labs::{Entitlement, LabFigures, LabRow, LabUse, share_error};
 pub use measurements::{Measurement, NewMeasurement};
 pub use models::{Model, NewModel};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
-pub use requests::{Asked, Request, RequestMark};
+pub use requests::{Asked, Request};
+pub use reservations::Reservations;
 pub use tasks::{TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState};
 pub use tokens::Token;
-pub use workers::{WorkerPlace, WorkerRow, WorkerTask};
+pub use workers::{WorkerPlace, WorkerRow, WorkerTakes, WorkerTask};

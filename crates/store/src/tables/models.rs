@@ -12,7 +12,7 @@ use crate::tables::keys::Made;
 use crate::tables::requests;
 use engine::job::{CalibrationId, JobModel, Lab, Label, ModelFacts, ModelId, Sha256, Timestamp};
 
-/// What is known of an end-to-end network when it has been checked.
+/// Facts of an end-to-end network that has passed its check.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct NewModel {
     pub name: Option<Label>,

@@ -6,8 +6,6 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use sqlx::SqliteConnection;
-
 use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::locked::LockedFile;
@@ -15,16 +13,16 @@ use crate::rows::Page;
 use crate::tables::keys::{self, Inserted, Made, RequestKey};
 use crate::tables::quota;
 use crate::{Store, dir, on_files};
-use engine::job::{Lab, PartialId, Sha256, TaskState, Timestamp, TokenId};
+use engine::job::{Lab, PartialId, Sha256, Timestamp, TokenId};
 
 #[derive(Debug, Clone)]
 pub struct NewPartial {
     pub lab: Lab,
-    /// Whose limit it counts against.
+    /// The token against whose limit it counts.
     pub token: Option<TokenId>,
     /// Bytes of the whole file.
     pub length: u64,
-    /// What the client tells of the file, as it was sent.
+    /// The client's metadata of the file, unchanged.
     pub metadata: String,
     /// The hash that the client says the whole file has.
     pub expected: Option<Sha256>,
@@ -35,11 +33,11 @@ from_row!(NewPartial, row => { lab, token, length, metadata, expected });
 #[derive(Debug, Clone)]
 pub struct Partial {
     pub id: PartialId,
-    /// What was said when it was begun.
+    /// The facts from its announcement.
     pub facts: NewPartial,
     /// Bytes that are on the disk.
     pub received: u64,
-    /// The hash of the stored file, once all is there.
+    /// The hash of the stored file, once it is complete.
     pub result: Option<Sha256>,
     /// When it is given up if nothing more comes.
     pub expires_at: Timestamp,
@@ -53,14 +51,14 @@ from_row!(Partial, row => {
     expires_at,
 });
 
-/// Bytes that are reserved for an upload of which little has come. More are as it grows, so that nobody takes
-/// the disk by an announcement.
+/// Bytes that are reserved for a new upload. More are reserved as it grows, so that an announcement does not fill the
+/// disk.
 pub const FIRST_RESERVE: u64 = 64 << 20;
-/// How long an upload is kept of which nothing has come.
+/// Time for which an empty upload is kept.
 const EMPTY: Duration = Duration::from_secs(3600);
 
-/// The file of a partial upload and its row, for one request alone: the lock of the file is held until
-/// this is dropped, over data and row, so that nobody appends at an offset that is no longer true.
+/// The file and the row of a partial upload, for one request. The lock of the file protects both until this is dropped,
+/// so that no other request appends at an outdated offset.
 #[derive(Debug)]
 pub struct PartialFile {
     upload: Partial,
@@ -68,10 +66,10 @@ pub struct PartialFile {
     path: PathBuf,
 }
 
-/// What a request finds that wants to go on with an upload.
+/// The upload that a request wants to continue.
 #[derive(Debug)]
 pub enum FoundPartial {
-    /// The file, behind the last byte on record.
+    /// The file, positioned after the last recorded byte.
     Open(PartialFile),
     /// Another request has it.
     Busy,
@@ -80,18 +78,18 @@ pub enum FoundPartial {
 }
 
 impl PartialFile {
-    /// The row, as it stands under the lock.
+    /// The row as read under the lock.
     pub fn upload(&self) -> &Partial {
         &self.upload
     }
 
-    /// True if nothing is missing but to store it.
+    /// True if all bytes are received.
     pub fn is_complete(&self) -> bool {
         self.upload.received == self.upload.facts.length
     }
 
-    /// Drops what was written without being recorded. A file that lacks bytes on record is refused: to
-    /// extend it would make zeros of them.
+    /// Cuts off bytes that were written but not recorded. A file that lacks recorded bytes is refused: extending it
+    /// would fill them with zeros.
     fn ready(mut file: LockedFile, path: PathBuf, upload: Partial) -> Result<Self> {
         let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
         if bytes < upload.received {
@@ -132,8 +130,8 @@ fn lock(path: &Path) -> Result<Lock> {
         Err(TryLockError::WouldBlock) => return Ok(Lock::Busy),
         Err(TryLockError::Error(error)) => return Err(StoreError::io("lock", path)(error)),
     };
-    // Whoever had the lock before may have stored or ended the upload: the file that was opened may be
-    // a blob by now, which nobody may write to.
+    // The last holder of the lock may have stored or ended the upload. The opened file may be a blob by now, which must
+    // not be written.
     let opened = file.metadata().map_err(StoreError::io("read", path))?;
     let same = std::fs::metadata(path)
         .is_ok_and(|now| (now.dev(), now.ino()) == (opened.dev(), opened.ino()));
@@ -152,7 +150,7 @@ impl Store {
         let id = PartialId::new();
         let expires_at = after(age.min(EMPTY));
         let path = self.dir().partial(id);
-        // Locked until its row is there, so that it is nobody's for no moment.
+        // Locked until its row exists, so that no other request takes it.
         let made = path.clone();
         let _lock = on_files(move || {
             let file = File::create_new(&path).map_err(StoreError::io("make", &path))?;
@@ -228,8 +226,7 @@ impl Store {
     }
 
     /// Takes an upload for this request alone, unless another one has it.
-    /// Errors: [`StoreError::NotFound`] if it is gone; [`StoreError::Short`] if bytes on record are
-    /// lost.
+    /// Errors: [`StoreError::NotFound`] if it was deleted; [`StoreError::Short`] if recorded bytes are lost.
     pub async fn open_partial(&self, lab: &Lab, id: PartialId) -> Result<FoundPartial> {
         let upload = self.partial(lab, id).await?;
         if upload.result.is_some() {
@@ -284,10 +281,10 @@ impl Store {
         Ok(())
     }
 
-    /// Moves an upload of which all bytes are there into the store, as an upload of its lab. Its
-    /// hash is that of the file as it lies on the disk.
-    /// Errors: [`StoreError::HashMismatch`] if the client named another hash; the upload is ended
-    /// then. [`StoreError::Short`] if the file has not the length that was announced.
+    /// Moves a complete upload into the store, as an upload of its lab. Its hash is that of the file as it lies on the
+    /// disk.
+    /// Errors: [`StoreError::HashMismatch`] if the client named another hash; the upload is ended then.
+    /// [`StoreError::Short`] if the file has not the length that was announced.
     pub async fn finish_partial(&self, partial: PartialFile) -> Result<Partial> {
         // The file is open, and so locked, until the upload is stored and its row says so.
         let PartialFile { mut upload, file, path } = partial;
@@ -315,7 +312,7 @@ impl Store {
         Ok(upload)
     }
 
-    /// Ends an upload that no other request has; what has come of it goes. False if it is busy.
+    /// Ends an upload that no other request has, and removes its bytes. False if it is busy.
     pub async fn delete_partial(&self, id: PartialId) -> Result<bool> {
         let path = self.dir().partial(id);
         let lock = on_files(move || lock(&path)).await?;
@@ -361,31 +358,6 @@ impl Store {
         }
         Ok(ended)
     }
-
-    /// Bytes of the disk that are reserved and not written yet.
-    pub async fn promised_bytes(&self) -> Result<u64> {
-        promised(&mut *self.readers.acquire().await?).await
-    }
-}
-
-/// Bytes of the disk that are reserved and not written yet: the next ones of uploads in pieces, prepared arrays, and
-/// snapshots of jobs. Masks from captures count twice: they are scaled at the end.
-pub async fn promised(connection: &mut SqliteConnection) -> Result<u64> {
-    let bytes: f64 = sql_as!(
-        "SELECT (SELECT coalesce(sum(min(length - received, max(received, ?2))), 0)
-                 FROM partials WHERE result IS NULL)
-              + (SELECT coalesce(sum(prepared_bytes * iif(request ->> '$.captures' IS NULL, 1, 2)), 0)
-                 FROM requests WHERE prepared_bytes > 0)
-              + (SELECT coalesce(sum(disk_bytes * (
-                     SELECT count(*) FILTER (WHERE state <> ?1) * 1.0 / count(*)
-                     FROM tasks WHERE job = jobs.id AND kind = 'assemble')), 0.0)
-                 FROM jobs WHERE finished_at IS NULL)",
-        [TaskState::Done, FIRST_RESERVE]
-    )
-    .fetch_one(connection)
-    .await?;
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // a sum of bytes
-    Ok(bytes as u64)
 }
 
 fn after(age: Duration) -> Timestamp {

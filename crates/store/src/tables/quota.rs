@@ -6,6 +6,7 @@ use sqlx::SqliteConnection;
 use crate::Store;
 use crate::columns::sql_as;
 use crate::error::{Result, StoreError};
+use crate::tables::labs;
 use engine::job::{Lab, TokenId};
 
 /// Checks of a lab that may wait and run at a time.
@@ -25,7 +26,7 @@ impl Store {
         token_bytes(&mut *self.readers.acquire().await?, token).await
     }
 
-    /// Bytes that a lab keeps here: uploads, prepared arrays and results, and what was promised to it.
+    /// Bytes that a lab keeps here: uploads, prepared arrays and results, and bytes reserved for it.
     pub async fn lab_bytes(&self, lab: &Lab) -> Result<u64> {
         lab_bytes(&mut *self.readers.acquire().await?, lab).await
     }
@@ -38,8 +39,7 @@ pub async fn check(
     token: Option<TokenId>,
     needed: u64,
 ) -> Result<()> {
-    let limit = "SELECT max_bytes FROM labs WHERE lab = ? AND max_bytes IS NOT NULL";
-    if let Some(limit) = sql_as!(limit, [lab]).fetch_optional(&mut *connection).await? {
+    if let (Some(limit), _) = labs::limits(connection, lab).await? {
         let kept = lab_bytes(connection, lab).await?;
         within("lab", kept, needed, limit)?;
     }
@@ -59,57 +59,47 @@ fn within(whose: &'static str, kept: u64, needed: u64, limit: u64) -> Result<()>
     Err(StoreError::Quota { whose, kept, needed, limit })
 }
 
-/// Bytes that an owner, ?1, keeps here of uploads, whole and begun, and of prepared arrays. `$owner` is the
-/// column that names the owner: `lab` or `token`.
-macro_rules! files_of {
-    ($owner:literal) => {
-        concat!(
-            "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
-                     WHERE ",
-            $owner,
-            " = ?1)
-                  + (SELECT coalesce(sum(length), 0) FROM partials
-                     WHERE ",
-            $owner,
-            " = ?1 AND result IS NULL)
-                  + (SELECT coalesce(sum(size), 0) FROM blobs
-                     WHERE sha256 IN (SELECT prepared FROM calibrations WHERE ",
-            $owner,
-            " = ?1
-                                      UNION SELECT prepared FROM measurements WHERE ",
-            $owner,
-            " = ?1))
-                  + (SELECT coalesce(sum(prepared_bytes), 0) FROM requests
-                     WHERE ",
-            $owner,
-            " = ?1)"
-        )
-    };
-}
-
+/// Bytes of uploads, whole and begun, and of prepared arrays, that count against a token.
 async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Result<u64> {
-    sql_as!(files_of!("token"), [token]).fetch_one(connection).await
+    sql_as!(
+        "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
+                 WHERE token = ?1)
+              + (SELECT coalesce(sum(length), 0) FROM partials WHERE token = ?1 AND result IS NULL)
+              + (SELECT coalesce(sum(size), 0) FROM blobs
+                 WHERE sha256 IN (SELECT prepared FROM calibrations WHERE token = ?1
+                                  UNION SELECT prepared FROM measurements WHERE token = ?1))
+              + (SELECT coalesce(sum(prepared_bytes), 0) FROM requests
+                 WHERE token = ?1 AND prepared_bytes > 0)",
+        [token]
+    )
+    .fetch_one(connection)
+    .await
 }
 
+/// Bytes of all files of a lab, and bytes reserved for its uploads and jobs.
 async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> {
-    let text = concat!(
-        files_of!("lab"),
-        " + (SELECT coalesce(sum(size), 0) FROM tasks JOIN blobs ON sha256 = result
-             WHERE lab = ?1 AND thing IS NOT NULL AND result IS NOT NULL)
-          + (SELECT coalesce(sum(iif(finished_at IS NULL, disk_bytes, result_bytes)), 0)
-             FROM jobs WHERE lab = ?1)"
-    );
-    sql_as!(text, [lab]).fetch_one(connection).await
+    sql_as!(
+        "SELECT (SELECT coalesce(sum(bytes), 0) FROM files_of_labs WHERE lab = ?1)
+              + (SELECT coalesce(sum(length), 0) FROM partials WHERE lab = ?1 AND result IS NULL)
+              + (SELECT coalesce(sum(prepared_bytes), 0) FROM requests
+                 WHERE lab = ?1 AND prepared_bytes > 0)
+              + (SELECT coalesce(sum(iif(state IN ('queued', 'running', 'cancelling'),
+                                         disk_bytes, result_bytes)), 0)
+                 FROM jobs_by_state WHERE lab = ?1)",
+        [lab]
+    )
+    .fetch_one(connection)
+    .await
 }
 
-/// Refuses a job if enough wait and run. A lab has its own limit, if one was set. When all places are taken,
-/// a lab that has less than an equal part of them is let in nevertheless, so that none locks the others out.
+/// Refuses a job if enough wait and run. A lab has its own limit, if one was set. When all places are taken, a lab with
+/// less than an equal part of them is accepted nevertheless, so that no lab excludes the others.
 /// Errors: [`StoreError::QueueFull`].
 pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64) -> Result<()> {
-    let (all, own, limit): (u64, u64, Option<u64>) = sql_as!(
-        "SELECT (SELECT count(*) FROM jobs WHERE finished_at IS NULL),
-                (SELECT count(*) FROM jobs WHERE finished_at IS NULL AND lab = ?1),
-                (SELECT max_jobs FROM labs WHERE lab = ?1)",
+    let (_, limit) = labs::limits(connection, lab).await?;
+    let (all, own): (u64, u64) = sql_as!(
+        "SELECT coalesce(sum(jobs), 0), coalesce(sum(jobs) FILTER (WHERE lab = ?1), 0)
+         FROM jobs_by_state WHERE state IN ('queued', 'running', 'cancelling')",
         [lab]
     )
     .fetch_one(&mut *connection)
@@ -120,7 +110,8 @@ pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64)
     if all < most {
         return Ok(());
     }
-    let labs = "SELECT count(DISTINCT lab) FROM jobs WHERE finished_at IS NULL AND lab <> ?";
+    let labs = "SELECT count(DISTINCT lab) FROM jobs_by_state
+                WHERE state IN ('queued', 'running', 'cancelling') AND jobs > 0 AND lab <> ?";
     let others: u64 = sql_as!(labs, [lab]).fetch_one(connection).await?;
     if own < most / (others + 1) {
         return Ok(());

@@ -1,4 +1,4 @@
-//! Tables `calibration_reports` and `calibration_maps`: what is told of masks, and its pictures.
+//! Tables `calibration_reports` and `calibration_maps`: reports on masks, and their pictures.
 
 use sqlx::SqliteConnection;
 

@@ -17,7 +17,7 @@ use crate::tables::keys::Made;
 use engine::intake::Refusal;
 use engine::job::{CheckLimits, Lab, Label, Submission, TaskState, ThingId, Timestamp, TokenId};
 
-/// A request on record.
+/// A request with its progress.
 #[derive(Debug, Clone)]
 pub struct Request {
     /// Identifier of the calibration, measurement or model.
@@ -41,14 +41,6 @@ pub enum Asked<T> {
     Ready(T),
     /// It is being checked or made, or was refused.
     Pending(Box<Request>),
-}
-
-/// Changes when a calibration, measurement or model does.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RequestMark {
-    /// Ordinal, state and progress of the latest task.
-    task: Option<(i64, TaskState, f64)>,
-    name: Option<Label>,
 }
 
 impl Made {
@@ -105,14 +97,14 @@ impl Store {
         request.fetch_optional(&self.readers).await
     }
 
-    /// True if the uploads of a request are checked, or nobody wants that any more.
+    /// True if the uploads of a request are checked, or the request was deleted.
     pub async fn is_checked(&self, id: impl Into<ThingId>) -> Result<bool> {
         let check = "SELECT 1 FROM tasks WHERE thing = ? AND kind = 'check' AND state IN (?, ?)";
         let check = sql!(check, [id.into(), TaskState::Ready, TaskState::Running]);
         Ok(check.fetch_optional(&self.readers).await?.is_none())
     }
 
-    /// True if what was asked for is there, or was refused, or deleted.
+    /// True if a request is fulfilled, refused or deleted.
     pub async fn is_settled(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<bool> {
         let pending = "SELECT 1 FROM requests
                        WHERE id = ?1 AND lab = ?2 AND refusal IS NULL
@@ -160,29 +152,6 @@ impl Store {
         Ok(Page { items: page.items.into_iter().map(asked).collect(), more: page.more })
     }
 
-    /// A mark of each calibration, measurement or model, by its lab and identifier.
-    pub async fn request_marks<Id>(&self, what: Made) -> Result<HashMap<(Lab, Id), RequestMark>>
-    where
-        Id: From<ThingId> + Eq + std::hash::Hash,
-    {
-        type Found = (Lab, ThingId, Option<Label>, Option<i64>, Option<TaskState>, Option<f64>);
-        // The columns are those of the row with the largest ordinal.
-        let rows: Vec<Found> = sql_as!(
-            "SELECT requests.lab, requests.id, name, max(ordinal), state, fraction
-             FROM requests LEFT JOIN tasks ON thing = requests.id WHERE what = ?
-             GROUP BY requests.id",
-            [what.into_str()]
-        )
-        .fetch_all(&self.readers)
-        .await?;
-        let mark = |(lab, id, name, ordinal, state, fraction): Found| {
-            let task = ordinal.zip(state).zip(fraction);
-            let task = task.map(|((ordinal, state), fraction)| (ordinal, state, fraction));
-            ((lab, id.into()), RequestMark { task, name })
-        };
-        Ok(rows.into_iter().map(mark).collect())
-    }
-
     /// Removes a request that its check refused. False if there is no such request, as of captures that passed the
     /// check and could not be used.
     pub async fn drop_refused(&self, id: impl Into<ThingId>) -> Result<bool> {
@@ -194,7 +163,7 @@ impl Store {
 }
 
 /// Records a request, with the uploads that it needs. Returns their size in bytes.
-/// Errors: [`StoreError::NotFound`] if an upload or the calibration is gone.
+/// Errors: [`StoreError::NotFound`] if an upload or the calibration was deleted.
 pub async fn insert(
     connection: &mut SqliteConnection,
     (lab, token): (&Lab, Option<TokenId>),
@@ -252,7 +221,7 @@ pub async fn limits(connection: &mut SqliteConnection, id: ThingId) -> Result<Ch
     Ok(limits)
 }
 
-/// Promises disk space for what is being made; the promise ends when that is on record, or refused.
+/// Reserves disk space for the product of a request, until its row is written or the request is refused.
 pub async fn promise(connection: &mut SqliteConnection, id: ThingId, bytes: u64) -> Result<()> {
     sql!("UPDATE requests SET prepared_bytes = ? WHERE id = ?", [bytes, id])
         .execute(connection)
@@ -267,8 +236,8 @@ pub async fn fulfil(connection: &mut SqliteConnection, id: ThingId) -> Result<()
     Ok(())
 }
 
-/// Records why nothing is made of a request. Its key is free again, as after any refusal. A calibration that is
-/// there already, and lacks its report, is left alone.
+/// Records why nothing is made of a request. Its key is free again, as after any refusal. A calibration that has masks
+/// and lacks its report stays unchanged.
 pub async fn refuse(
     connection: &mut SqliteConnection,
     id: ThingId,
@@ -297,7 +266,8 @@ pub async fn rename(
     found(renamed.rows_affected(), what, id)
 }
 
-/// Removes a request of a lab. Its tasks go with it: a worker that has one finds that nobody wants it any more.
+/// Removes a request of a lab. Its tasks are deleted with it: a worker that has one learns this from its next
+/// heartbeat.
 pub async fn delete(
     connection: &mut SqliteConnection,
     (lab, what, id): (&Lab, Made, ThingId),
@@ -311,7 +281,7 @@ fn found(rows: u64, what: Made, id: ThingId) -> Result<()> {
     if rows > 0 { Ok(()) } else { Err(StoreError::missing(what.into_str(), id)) }
 }
 
-/// Number of measurements or models of a calibration that are there or being made.
+/// Number of measurements or models of a calibration, ready or being made.
 pub const USERS: [(&str, &str); 2] = [
     (
         "measurements",

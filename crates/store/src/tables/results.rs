@@ -33,7 +33,7 @@ impl Store {
             Some(snapshot) => self.dir().snapshot_results(job.id, snapshot),
             None => self.dir().results(job.id),
         };
-        // The name is the one on record, which a worker wrote: not the one in the request.
+        // The name comes from the record that a worker wrote, not from the request.
         let path = folder.join(&file.name);
         Ok((file, path))
     }

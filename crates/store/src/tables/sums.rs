@@ -1,4 +1,4 @@
-//! Table `job_sums`: what the tasks of each job add up to, counted anew whenever one of them ends.
+//! Table `job_sums`: sums over the tasks of each job, recounted whenever one of them ends.
 
 use sqlx::SqliteConnection;
 

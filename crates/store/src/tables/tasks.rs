@@ -1,4 +1,4 @@
-//! Table `tasks`: what they are, what they have made, and how they go. Only the queue changes it.
+//! Table `tasks`: their kinds, products and progress. Only the queue changes it.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use crate::columns::{Columns, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use engine::job::{JobId, RunSpec, Sha256, TaskKind, TaskState, ThingId};
 
-/// What a task belongs to, and goes with.
+/// Owner of a task, with which it is deleted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Owner {
     /// The job that it belongs to.
@@ -39,7 +39,7 @@ from_row!(TileResult, row => {
     record = row.read::<Json<_>>("record")?.0,
 });
 
-/// What is known of a task that is done.
+/// Record of a task that is done.
 #[derive(Debug, Clone)]
 pub struct TaskRecord {
     pub kind: TaskKind,
@@ -85,7 +85,7 @@ from_row!(TileState, row => {
     residual,
 });
 
-/// How the solver went on a tile.
+/// Convergence history of a tile.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TileHistory {
     pub tile: u32,
@@ -96,7 +96,7 @@ pub struct TileHistory {
 
 from_row!(TileHistory, row => { tile, state, points = row.read::<Json<_>>("history")?.0 });
 
-/// What has been done in all by tasks of a kind, those of deleted jobs with them.
+/// Totals of the completed tasks of a kind, deleted jobs included.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TaskTotals {
     pub kind: String,
@@ -139,11 +139,19 @@ impl Store {
         Ok(tiles)
     }
 
-    /// What is known of all tasks of a job that are done, in order.
+    /// Records of all tasks of a job that are done, in order.
     pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>> {
         let rows = sql!(
-            "SELECT kind, snapshot, snapshots, tile, record, seconds, attempt FROM tasks
-             WHERE job = ? AND state = ? ORDER BY ordinal",
+            // A record that was shortened gets its files back.
+            "SELECT kind, snapshot, snapshots, tile, seconds, attempt,
+                 iif(kind = 'assemble' AND record ->> '$.summary' IS NOT NULL
+                         AND record ->> '$.files' IS NULL,
+                     json_set(record, '$.files',
+                         (SELECT json_group_array(json_object('name', name, 'size', size, 'sha256', sha256))
+                          FROM result_files
+                          WHERE result_files.job = tasks.job AND result_files.snapshot = tasks.snapshot)),
+                     record) AS record
+             FROM tasks WHERE job = ? AND state = ? ORDER BY ordinal",
             [job, TaskState::Done]
         )
         .fetch_all(&self.readers)
@@ -173,8 +181,8 @@ impl Store {
         Ok(tiles)
     }
 
-    /// How the solver went on a tile of the last run that holds a snapshot (that which begins with it, if
-    /// one does); none if there is no such tile.
+    /// Convergence history of a tile of the last run that holds a snapshot (that which begins with it, if one does);
+    /// none if there is no such tile.
     pub async fn tile_history(
         &self,
         job: JobId,
@@ -193,28 +201,25 @@ impl Store {
         Ok(history)
     }
 
-    /// Version of ONNX Runtime that the last worker told that finished a tile with it; none before.
+    /// Version of ONNX Runtime that the last worker reported which finished a tile with it; none before.
     pub async fn last_onnxruntime(&self) -> Result<Option<String>> {
         let version = sql_as!(
-            "SELECT record ->> 'onnxruntime' FROM tasks
-             WHERE state = ? AND kind = 'tile' AND record ->> 'onnxruntime' IS NOT NULL
-             ORDER BY job DESC LIMIT 1",
-            [TaskState::Done]
+            "SELECT onnxruntime FROM totals WHERE kind = 'tile' AND onnxruntime IS NOT NULL"
         )
         .fetch_optional(&self.readers)
         .await?;
         Ok(version)
     }
 
-    /// What has been done in all, by kind of task.
+    /// Totals of completed tasks, by kind.
     pub async fn totals(&self) -> Result<Vec<TaskTotals>> {
         sql_as!("SELECT * FROM totals ORDER BY kind").fetch_all(&self.readers).await
     }
 
-    /// The number of tasks by kind and state, with zeros for what there is none of.
+    /// The number of tasks by kind and state, zeros included.
     pub async fn task_counts(&self) -> Result<TaskCounts> {
         let found: Vec<(String, TaskState, u64)> =
-            sql_as!("SELECT kind, state, count(*) FROM tasks GROUP BY kind, state")
+            sql_as!("SELECT kind, state, tasks FROM tasks_by_state")
                 .fetch_all(&self.readers)
                 .await?;
         let mut counts = TaskCounts::new();
@@ -234,7 +239,7 @@ pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
         .ok_or(StoreError::Corrupt { column: "kind", value: name })
 }
 
-/// What the task in this row belongs to.
+/// Owner of the task in this row.
 pub fn owner(row: &SqliteRow) -> Result<Owner> {
     Ok(match row.read("job")? {
         Some(job) => Owner::Job(job),

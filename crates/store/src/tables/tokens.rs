@@ -1,4 +1,4 @@
-//! Tables `tokens` and `sessions`: who may come in.
+//! Tables `tokens` and `sessions`: access to the service.
 
 use super::labs;
 use crate::Store;
@@ -11,7 +11,7 @@ const USE_NOTED: i64 = 300_000;
 /// Sessions of a token at the same time; the oldest give way.
 const SESSIONS: u32 = 64;
 
-/// A token on record, without the secret.
+/// A token, without the secret.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Token {
     /// Its identifier, which is no secret.
@@ -22,7 +22,7 @@ pub struct Token {
     pub all_labs: bool,
     /// Whom it was given to.
     pub note: Option<Label>,
-    /// Bytes of uploads, and of what is prepared of them, that it may keep here; none: no limit.
+    /// Limit for the bytes of its uploads and of the arrays prepared from them; `None` for no limit.
     pub max_bytes: Option<u64>,
     pub created_at: Timestamp,
     /// From when on it is worth nothing; none: never.
@@ -89,7 +89,7 @@ impl Store {
         token.fetch_optional(&self.readers).await
     }
 
-    /// Whether a token still opens anything.
+    /// True if a token is valid.
     pub async fn token_holds(&self, id: TokenId) -> Result<bool> {
         let token = "SELECT 1 FROM tokens
                      WHERE id = ? AND revoked_at IS NULL AND (expires_at IS NULL OR expires_at > ?)";
@@ -106,7 +106,7 @@ impl Store {
         token.fetch_optional(&self.readers).await
     }
 
-    /// Records a session by the hash of its secret. Those that have expired are forgotten.
+    /// Records a session by the hash of its secret. Expired ones are deleted.
     pub async fn add_session(
         &self,
         token: TokenId,
@@ -164,7 +164,7 @@ impl Store {
         Ok(listed)
     }
 
-    /// Revokes a token, for ever. A second time changes nothing.
+    /// Revokes a token, for ever. Repeating it changes nothing.
     pub async fn revoke_token(&self, id: TokenId) -> Result<()> {
         let changed = sql!(
             "UPDATE tokens SET revoked_at = coalesce(revoked_at, ?) WHERE id = ?",

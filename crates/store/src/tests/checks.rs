@@ -31,12 +31,12 @@ impl Lab {
     }
 
     async fn promised(&self) -> u64 {
-        self.store.promised_bytes().await.unwrap()
+        self.store.reservations().await.unwrap().total()
     }
 }
 
 #[tokio::test]
-async fn the_light_worker_takes_checks_and_short_tasks_of_jobs_that_others_have_begun() {
+async fn the_light_worker_takes_checks_and_short_tasks_of_running_jobs() {
     let lab = Lab::new().await;
     let light = async || lab.store.claim_as(Claimant::Light, lab.worker, LEASE).await.unwrap();
     lab.submit(0).await;
@@ -144,7 +144,7 @@ async fn a_check_outlives_a_lease_that_runs_out_and_a_shutdown() {
 }
 
 #[tokio::test]
-async fn who_checks_what_was_deleted_is_told_to_stop() {
+async fn a_check_of_a_deleted_request_stops() {
     let lab = Lab::new().await;
     let local = engine::job::Lab::local();
     let key = RequestKey { key: "k".into(), request: Sha256::of(b"request") };

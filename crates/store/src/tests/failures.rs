@@ -37,7 +37,7 @@ async fn a_task_that_crashes_its_workers_is_given_up() {
 }
 
 #[tokio::test]
-async fn a_task_that_takes_all_memory_is_given_up_and_one_without_room_is_not() {
+async fn a_task_without_memory_fails_and_one_without_disk_waits() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
     for _ in 0..30 {
@@ -57,7 +57,7 @@ async fn a_task_that_takes_all_memory_is_given_up_and_one_without_room_is_not() 
 }
 
 #[tokio::test]
-async fn a_task_that_is_interrupted_is_not_given_up_for_a_long_time() {
+async fn an_interrupted_task_is_retried_many_times() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
     for _ in 1..MAX_LOSSES {

@@ -1,10 +1,13 @@
-//! What is listed, what is kept, and what goes.
+//! Lists, idempotency keys, and removal of unused things.
 
 use std::io::Write;
+use std::time::Duration;
+
+use futures_util::FutureExt;
 
 use super::Lab;
 use crate::{Checked, Inserted, JobFilter, StoreError};
-use engine::job::{ModelFacts, ModelId, ModelRequest, ModelTrial, Submission, Timestamp};
+use engine::job::{JobId, ModelFacts, ModelId, ModelRequest, ModelTrial, Submission, Timestamp};
 
 #[tokio::test]
 async fn a_key_makes_one_job() {
@@ -46,7 +49,7 @@ async fn pages_join_without_gaps() {
 }
 
 #[tokio::test]
-async fn what_is_in_use_is_not_deleted_and_what_is_unused_is_collected() {
+async fn used_things_are_kept_and_unused_ones_collected() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
     let calibration =
@@ -96,4 +99,60 @@ async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
     lab.store.delete_model(&local, model.id).await.unwrap();
     assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the network");
     lab.store.delete_calibration(&local, calibration).await.unwrap();
+}
+
+/// True if the job exists with all its files, or neither it nor a file of it.
+async fn is_whole(lab: &Lab, id: JobId) -> bool {
+    let folder = lab.store.dir().results(id);
+    let Ok(job) = lab.store.job(&engine::job::Lab::local(), id).await else {
+        return !folder.exists();
+    };
+    for snapshot in [Some(0), Some(1), None] {
+        for file in lab.store.result_files(&job, snapshot).await.unwrap() {
+            if lab.store.open_result(&job, snapshot, &file.name).await.is_err() {
+                return false;
+            }
+        }
+    }
+    folder.exists()
+}
+
+#[tokio::test]
+async fn a_deletion_that_is_broken_off_leaves_no_job_without_files() {
+    let lab = Lab::new().await;
+    let local = engine::job::Lab::local();
+    let (mut deleted, mut left) = (0, 0);
+    for steps in 0.. {
+        let id = lab.submit(0).await;
+        lab.work_off().await;
+        let ended = {
+            let mut deletion = Box::pin(lab.store.delete_job(&local, id));
+            let mut ended = false;
+            for _ in 0..steps {
+                ended = (&mut deletion).now_or_never().is_some();
+                if ended {
+                    break;
+                }
+                tokio::time::sleep(Duration::from_millis(2)).await;
+            }
+            ended
+        };
+        // Work on files that has begun goes on.
+        tokio::time::sleep(Duration::from_millis(20)).await;
+        let is_there = lab.store.job(&local, id).await.is_ok();
+        assert!(!is_there || is_whole(&lab, id).await, "a job without files after {steps} steps");
+        // As at the next start.
+        lab.store.finish_removals().await.unwrap();
+        assert!(is_whole(&lab, id).await, "after {steps} steps");
+        if is_there {
+            left += 1
+        } else {
+            deleted += 1
+        }
+        if ended {
+            break;
+        }
+    }
+    assert!(deleted > 1 && left > 1, "{deleted} {left}");
+    assert_eq!(lab.store.quarantine_orphans(false).await.unwrap(), 0);
 }

@@ -1,8 +1,8 @@
-//! Movies: asked for at any time, made last, gone with what they show.
+//! Movies: requested at any time, made in the turns of their lab, deleted with their jobs.
 
 use super::{LEASE, Lab};
 use crate::{Claimant, Heartbeat, Job, Movie};
-use engine::job::{JobId, JobState, TaskKind};
+use engine::job::{Algorithm, JobId, JobState, TaskKind};
 
 impl Lab {
     async fn done(&self) -> Job {
@@ -19,7 +19,7 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_movie_is_made_when_nothing_else_is_to_be_done() {
+async fn a_movie_comes_before_the_jobs_of_its_lab() {
     let lab = Lab::new().await;
     let job = lab.done().await;
     for _ in 0..2 {
@@ -29,8 +29,8 @@ async fn a_movie_is_made_when_nothing_else_is_to_be_done() {
     let other = lab.submit(-100).await;
     let done = lab.work_off().await;
     let movies = [TaskKind::Movie { snapshot: Some(1) }, TaskKind::Movie { snapshot: None }];
-    assert_eq!(done[done.len() - 3], TaskKind::Manifest, "{done:?}");
-    assert!(movies.iter().all(|movie| done[done.len() - 2..].contains(movie)), "{done:?}");
+    assert_eq!(done[done.len() - 1], TaskKind::Manifest, "{done:?}");
+    assert!(movies.iter().all(|movie| done[..2].contains(movie)), "{done:?}");
     lab.job(other).await;
     let one = lab.store.movie(&job, Some(1)).await.unwrap();
     let all = lab.store.movie(&job, None).await.unwrap();
@@ -53,7 +53,7 @@ async fn a_movie_that_fails_fails_nothing_else() {
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(Some(0.0)));
     lab.store.fail(&task.lease, "no codec", false).await.unwrap();
     lab.job(job.id).await;
-    // It is told once, and then tried again.
+    // The failure is reported once, and then another attempt begins.
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Failed("no codec".into()));
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(None));
 
@@ -63,4 +63,32 @@ async fn a_movie_that_fails_fails_nothing_else() {
     lab.store.delete_job(&engine::job::Lab::local(), job.id).await.unwrap();
     assert_eq!(lab.work(&task).await, Heartbeat::Lost);
     assert!(lab.claim().await.is_none());
+}
+
+#[tokio::test]
+async fn a_movie_takes_its_labs_turn_in_a_queue_that_never_ends() {
+    let lab = Lab::new().await;
+    let job = lab.done().await;
+    let other = "other".parse().unwrap();
+    for _ in 0..5 {
+        lab.submit(0).await;
+        lab.add_for(&other, Algorithm::GapTv, 0, None, b"request").await.unwrap();
+    }
+    // Jobs of both labs have begun.
+    lab.work_on(6).await;
+    lab.store.movie(&job, Some(0)).await.unwrap();
+    let mut before = 0;
+    loop {
+        let task = lab.claim().await.unwrap();
+        lab.work(&task).await;
+        if matches!(task.kind, TaskKind::Movie { .. }) {
+            break;
+        }
+        before += 1;
+    }
+    assert!(before <= 3, "{before} tasks came before it");
+    // An administrator's urgent job comes first.
+    lab.store.movie(&job, None).await.unwrap();
+    lab.submit(5).await;
+    assert_eq!(lab.claim().await.unwrap().kind, TaskKind::Prepare);
 }

@@ -9,7 +9,7 @@ use crate::{Begun, Claimant, MessagePlace};
 async fn a_tile_that_waits_elsewhere_does_not_run() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;
-    // What comes before the tiles.
+    // The tasks before the tiles.
     lab.work_on(3).await;
     let hub = WorkerId::new();
     let pool = Claimant::Pool("gpu");
@@ -19,7 +19,7 @@ async fn a_tile_that_waits_elsewhere_does_not_run() {
     let seen = async || {
         let job = lab.store.job(&engine::job::Lab::local(), job).await.unwrap();
         let running = lab.store.progress(&job).await.unwrap().tiles_running;
-        (running, lab.store.job_marks().await.unwrap())
+        (running, lab.store.last_change().await.unwrap())
     };
     let (running, waiting) = seen().await;
     assert_eq!(running, 0, "no worker has it in hand");
@@ -27,5 +27,8 @@ async fn a_tile_that_waits_elsewhere_does_not_run() {
     assert_eq!(begun.unwrap(), Begun::Go(1, false));
     let (running, begun) = seen().await;
     assert_eq!(running, 1);
-    assert!(begun != waiting, "who watches the job hears of it");
+    let changes = lab.store.changes(waiting).await.unwrap();
+    assert_eq!(changes.last, begun);
+    let changed = changes.items.unwrap();
+    assert_eq!((changed.len(), &changed[0].id), (1, &job.to_string()), "listeners learn of it");
 }

@@ -90,7 +90,7 @@ impl Statements {
                     return None;
                 }
                 let arguments = tokens(arguments);
-                // A rule of its own is marked with @.
+                // An internal rule is marked with @.
                 let own = arguments.first().is_some_and(|tree| is_mark(tree, '@'));
                 let arguments: TokenStream = arguments.into_iter().skip(usize::from(own)).collect();
                 let parts: Option<Vec<String>> =
@@ -118,7 +118,7 @@ impl Statements {
                     at += 4;
                     continue;
                 }
-                // Tests write statements of their own.
+                // Tests write other statements.
                 [TokenTree::Ident(word), _, body, ..] if word == "mod" && group(body).is_some() => {
                     at += 3;
                     continue;

@@ -1,8 +1,10 @@
-//! Whose turn it is: labs beside one another, and the jobs of a lab.
+//! Turns of labs, and the order of the jobs of a lab.
+
+use std::time::Duration;
 
 use super::{Lab, id};
-use crate::Entitlement;
-use engine::job::{Algorithm, JobId, TaskKind};
+use crate::{Entitlement, WorkerEnd, WorkerPlace, WorkerTakes};
+use engine::job::{Algorithm, JobId, TaskKind, WorkerId};
 
 fn named(name: &str) -> engine::job::Lab {
     name.parse().unwrap()
@@ -38,7 +40,7 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_lab_with_one_job_does_not_wait_for_all_jobs_of_another() {
+async fn a_single_job_does_not_wait_for_all_jobs_of_another_lab() {
     let lab = Lab::new().await;
     let mut first = Vec::new();
     for _ in 0..6 {
@@ -60,7 +62,7 @@ async fn a_share_is_a_share_of_what_is_computed() {
     lab.store.entitle(&named("second"), to).await.unwrap();
     let first = lab.submit_for("first", 0).await;
     let second = lab.submit_for("second", 0).await;
-    // Until tiles alone are left, of which each lab has four that cost the same.
+    // Until only tiles are left. Each lab has four, with equal costs.
     while lab.store.labs().await.unwrap().iter().any(|lab| lab.jobs > 0) {
         let task = lab.claim().await.unwrap();
         if matches!(task.kind, TaskKind::Tile { .. }) {
@@ -80,7 +82,7 @@ async fn a_share_is_a_share_of_what_is_computed() {
 }
 
 #[tokio::test]
-async fn who_wanted_nothing_is_owed_nothing() {
+async fn an_idle_lab_collects_no_credit() {
     let lab = Lab::new().await;
     for _ in 0..3 {
         lab.submit_for("busy", 0).await;
@@ -92,7 +94,7 @@ async fn who_wanted_nothing_is_owed_nothing() {
 }
 
 #[tokio::test]
-async fn begun_jobs_come_before_older_ones_that_have_not_begun() {
+async fn running_jobs_precede_older_waiting_ones() {
     let lab = Lab::new().await;
     let (old, young) = (lab.submit_for("lab", 0).await, lab.submit_for("lab", 0).await);
     lab.store.cancel_job(&named("lab"), old).await.unwrap();
@@ -108,4 +110,29 @@ async fn priority_comes_before_turns() {
     let urgent = lab.submit_for("second", 5).await;
     let turns = lab.turns(10).await;
     assert!(turns.iter().all(|job| *job == urgent), "{turns:?}");
+}
+
+#[tokio::test]
+async fn jobs_have_an_eta_only_while_a_worker_takes_tiles() {
+    let lab = Lab::new().await;
+    let local = named("local");
+    let job = lab.submit_for("local", 0).await;
+    let eta = async || {
+        // A forecast of one job is valid for a fraction of a millisecond.
+        tokio::time::sleep(Duration::from_millis(2)).await;
+        let job = lab.store.job(&local, job).await.unwrap();
+        lab.store.progress(&job).await.unwrap().eta_seconds
+    };
+    let age = Duration::from_secs(15);
+    assert!(eta().await.is_some());
+    assert_eq!(lab.store.live_tile_workers(age).await.unwrap(), 1);
+    lab.store.worker_ended(lab.worker, &WorkerEnd::Left).await.unwrap();
+    let last = lab.store.last_tile_worker().await.unwrap();
+    for takes in [WorkerTakes::WithoutTiles, WorkerTakes::ShortTasks] {
+        let place = WorkerPlace::default();
+        lab.store.worker_started(WorkerId::new(), 1, &place, takes).await.unwrap();
+    }
+    assert_eq!((eta().await, lab.store.live_tile_workers(age).await.unwrap()), (None, 0));
+    assert!(last.is_some(), "the sign of a worker that has ended");
+    assert_eq!(lab.store.last_tile_worker().await.unwrap(), last);
 }

@@ -1,4 +1,4 @@
-//! Arrays on their way, in the form of prepared ones.
+//! Converts arrays between memory and the format of prepared arrays, in which they travel.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use ndarray::{Array3, ArrayView3};
 use formats::planar::{self, Reader};
 use formats::{FormatError, Limits};
 
-/// An array \[B,h,w\] as bytes.
+/// Serializes an array \[B,h,w\].
 pub fn to_bytes(array: ArrayView3<'_, f32>) -> Result<Vec<u8>, FormatError> {
     let (count, height, width) = array.dim();
     let mut writer = planar::writer(Vec::new(), count, height, width)?;
@@ -15,7 +15,7 @@ pub fn to_bytes(array: ArrayView3<'_, f32>) -> Result<Vec<u8>, FormatError> {
     writer.finish()
 }
 
-/// The array in a file.
+/// Reads the array in a file.
 pub fn read(path: &Path) -> Result<Array3<f32>, FormatError> {
     let reader = Reader::open(path, &Limits::default())?;
     let info = reader.info();

@@ -1,9 +1,10 @@
-//! Who may do what on the message server: an operator whom the servers trust, one account for the
-//! service, and users in it, each with a token (JWT) that names its rights and its end. All are made
-//! here, without the server; only what is revoked is told to it, through a connection, so that it may
-//! be on other machines.
+//! Keys and credentials of the message server. The servers trust an operator. The operator signs one account for the
+//! service, and the account signs users. Each user has a token (JWT) that states rights and an expiry time.
 //!
-//! Tokens as in the NATS documentation ("JWT claims", version 2), signed with Ed25519.
+//! Credentials are created without the server. Only revocations are sent to it, over a connection, so that it may
+//! run on other machines.
+//!
+//! Tokens follow the NATS documentation ("JWT claims", version 2) and are signed with Ed25519.
 
 use std::fs;
 use std::io::Write;
@@ -21,57 +22,59 @@ use super::connection::{Access, ClusterError, Credential};
 use super::names;
 use engine::job::{Pool, Timestamp};
 
-/// The file with the keys, and with all that was made with them.
+/// The file with the keys and the list of issued credentials.
 const FILE: &str = "cluster.json";
 /// The credential of the server, `sci-recon serve`.
 pub const HUB: &str = "hub.creds";
-/// The credential that tells the message server of revocations.
+/// The credential that sends revocations to the message server.
 const SYSTEM: &str = "system.creds";
-/// The certificate by which workers know the message server.
+/// The certificate with which workers verify the message server.
 const CERTIFICATE: &str = "ca.pem";
 
-/// The keys of a cluster, and the credentials that were made with them.
+/// The keys of a cluster, and the credentials that were issued with them.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Authority {
     #[serde(skip)]
     folder: PathBuf,
-    /// Where workers reach the message server.
+    /// Address of the message server for workers.
     url: String,
     operator: String,
     system: String,
     account: String,
-    /// When the account's token was last made: the server believes the newest.
+    /// Time of the account's latest token, in Unix seconds. The server accepts the newest token.
     changed_at: i64,
-    /// Credentials of workers, in the order in which they were made.
+    /// Credentials of workers, oldest first.
     workers: Vec<Issued>,
 }
 
 /// A worker's credential.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Issued {
-    /// A name for people.
+    /// The name that a person chose.
     pub name: String,
-    /// The pool whose subjects it opens.
+    /// The pool that it gives access to.
     pub pool: Pool,
-    /// Its public key.
+    /// The public key of the user.
     pub key: String,
-    /// When it was made, and when it ends, in seconds of Unix time.
+    /// Time of issue, in Unix seconds.
     pub issued_at: i64,
-    /// The end.
+    /// Expiry time, in Unix seconds.
     pub expires_at: i64,
-    /// When it was revoked.
+    /// Time of revocation, in Unix seconds.
     pub revoked_at: Option<i64>,
 }
 
 impl Authority {
-    /// Makes new keys, and a folder for them.
+    /// Creates new keys in a folder.
     ///
     /// # Errors
-    /// If the folder has keys already, or can't be written.
+    /// If the folder already contains keys, or can't be written.
     pub fn create(folder: &Path, url: &str) -> Result<Self, ClusterError> {
         let path = folder.join(FILE);
         if path.exists() {
-            let reason = "there are keys already; credentials made with them would be void".into();
+            let reason =
+                "this file already contains keys; new keys would invalidate their credentials"
+                    .into();
             return Err(ClusterError::Authority { path: path.display().to_string(), reason });
         }
         fs::create_dir_all(folder).map_err(at(folder))?;
@@ -89,23 +92,24 @@ impl Authority {
         Ok(authority)
     }
 
-    /// Writes the credentials of the server and of the one who revokes. The certificates must be there
-    /// by then, if there are to be any.
+    /// Writes the credential of the server and the credential for revocations. Create certificates before, if the
+    /// connections are to be encrypted.
     ///
     /// # Errors
     /// If they can't be written.
     pub fn write_own_credentials(&self) -> Result<(), ClusterError> {
         let header = format!("url: {}\n{}", self.url, self.certificate()?);
-        let all = json!({"pub": {}, "sub": {}});
+        let unrestricted = json!({"pub": {}, "sub": {}});
         for (name, user, account) in [(HUB, "hub", &self.account), (SYSTEM, "system", &self.system)]
         {
             let path = self.folder.join(name);
-            write_user(&path, &KeyPair::new_user(), &pair(account)?, user, &all, None, &header)?;
+            let (key, account) = (KeyPair::new_user(), pair(account)?);
+            write_user(&path, &key, &account, user, &unrestricted, None, &header)?;
         }
         Ok(())
     }
 
-    /// The certificate of the authority, as PEM; nothing where nothing is encrypted.
+    /// The certificate of the authority as PEM. It is empty if connections are not encrypted.
     fn certificate(&self) -> Result<String, ClusterError> {
         let path = self.folder.join(CERTIFICATE);
         match fs::read_to_string(&path) {
@@ -114,16 +118,16 @@ impl Authority {
         }
     }
 
-    /// The keys in a folder.
+    /// Reads the keys in a folder.
     ///
     /// # Errors
-    /// If there are none, or they can't be read.
+    /// If the folder contains no keys, or they can't be read.
     pub fn open(folder: &Path) -> Result<Self, ClusterError> {
         let path = folder.join(FILE);
         let text = fs::read_to_string(&path).map_err(at(&path))?;
-        let mut found: Self = serde_json::from_str(&text).map_err(at(&path))?;
-        found.folder = folder.to_owned();
-        Ok(found)
+        let mut authority: Self = serde_json::from_str(&text).map_err(at(&path))?;
+        authority.folder = folder.to_owned();
+        Ok(authority)
     }
 
     /// The credentials of workers.
@@ -144,7 +148,7 @@ impl Authority {
         token(&operator, &operator.public_key(), "sci-recon", nats, self.changed_at, None)
     }
 
-    /// Public key and token of the system account and of the service's.
+    /// Public keys and tokens of the system account and of the service's account.
     ///
     /// # Errors
     /// If the keys are damaged.
@@ -155,11 +159,11 @@ impl Authority {
             "type": "account", "version": 2, "limits": limits(false),
             "default_permissions": {"pub": {}, "sub": {}},
         });
-        let of_system = token(&operator, &system, "SYS", nats, self.changed_at, None)?;
-        Ok([(system, of_system), self.account()?])
+        let system_token = token(&operator, &system, "SYS", nats, self.changed_at, None)?;
+        Ok([(system, system_token), self.account()?])
     }
 
-    /// Public key and token of the service's account, with all that is revoked.
+    /// Public key and token of the service's account. The token lists all revocations.
     fn account(&self) -> Result<(String, String), ClusterError> {
         let key = pair(&self.account)?.public_key();
         let revoked: Map<String, Value> = self
@@ -175,11 +179,11 @@ impl Authority {
         Ok((key, token))
     }
 
-    /// Makes a credential for the workers of a pool, which ends after so many days, and writes it to a
-    /// file that its owner alone may read.
+    /// Issues a credential for the workers of a pool, which expires after `days` days. The file is readable by its
+    /// owner only.
     ///
     /// # Errors
-    /// If there is a good one of this name, or the file can't be written.
+    /// If a valid credential has the same name, or the file can't be written.
     pub fn create_worker(
         &mut self,
         pool: &Pool,
@@ -187,9 +191,11 @@ impl Authority {
         days: u32,
         out: &Path,
     ) -> Result<(), ClusterError> {
-        let taken = |issued: &Issued| issued.name == name && issued.revoked_at.is_none();
-        if self.workers.iter().any(taken) {
-            let reason = format!("there is one called {name:?}: revoke it first, or name another");
+        let has_name = |issued: &Issued| issued.name == name && issued.revoked_at.is_none();
+        if self.workers.iter().any(has_name) {
+            let reason = format!(
+                "a credential is already called {name:?}: revoke it first, or choose another name"
+            );
             let path = self.folder.join(FILE).display().to_string();
             return Err(ClusterError::Authority { path, reason });
         }
@@ -203,7 +209,7 @@ impl Authority {
         });
         let authority = self.certificate()?;
         let header = format!(
-            "# A credential for workers of the pool {pool}, called {name}. Keep it as a password.\n\
+            "# Credential {name:?} for workers of the pool {pool}. Keep it secret, like a password.\n\
              url: {}\npool: {pool}\ninbox: {inbox}\n{authority}",
             self.url
         );
@@ -214,24 +220,23 @@ impl Authority {
         self.save()
     }
 
-    /// Revokes the credentials of a pool, or the one of this name in it. Gives their names. The message
-    /// server learns of it by [`Authority::publish`].
+    /// Revokes the credentials of a pool, or the one called `name`. Returns the names of those that were revoked now.
+    /// [`Authority::publish`] sends the revocations to the message server.
     ///
     /// # Errors
-    /// If there is none, or the folder can't be written.
+    /// If no credential matches, or the folder can't be written.
     pub fn revoke(&mut self, pool: &Pool, name: Option<&str>) -> Result<Vec<String>, ClusterError> {
         let now = seconds();
+        let matches =
+            |worker: &Issued| worker.pool == *pool && name.is_none_or(|name| name == worker.name);
         let mut revoked = Vec::new();
         for worker in &mut self.workers {
-            let meant = worker.pool == *pool && name.is_none_or(|name| name == worker.name);
-            if meant && worker.revoked_at.is_none() {
+            if matches(worker) && worker.revoked_at.is_none() {
                 worker.revoked_at = Some(now);
                 revoked.push(worker.name.clone());
             }
         }
-        let known =
-            |worker: &Issued| worker.pool == *pool && name.is_none_or(|name| name == worker.name);
-        if !self.workers.iter().any(known) {
+        if !self.workers.iter().any(matches) {
             let reason = format!("there is no such credential for the pool {pool}");
             let path = self.folder.join(FILE).display().to_string();
             return Err(ClusterError::Authority { path, reason });
@@ -241,21 +246,21 @@ impl Authority {
         Ok(revoked)
     }
 
-    /// Tells the message server what is revoked; it cuts off who is connected.
+    /// Sends the revocations to the message server, which disconnects the revoked users.
     ///
     /// # Errors
-    /// If it can't be reached, or does not take the token.
+    /// If it can't be reached, or does not accept the token.
     pub async fn publish(&self) -> Result<(), ClusterError> {
         let credential = Credential::read(&self.folder.join(SYSTEM))?;
         let connection = Access::new(None, &credential, "sci-recon cluster")?.connect().await?;
         let (_, token) = self.account()?;
-        let asked = connection.client.request("$SYS.REQ.CLAIMS.UPDATE", token.into()).await;
-        let answer = asked.map_err(ClusterError::nats("tell what is revoked"))?;
+        let answer = connection.client.request("$SYS.REQ.CLAIMS.UPDATE", token.into()).await;
+        let answer = answer.map_err(ClusterError::nats("send the revocations"))?;
         let answer: Value = serde_json::from_slice(&answer.payload)
-            .map_err(ClusterError::nats("read the answer to what is revoked"))?;
+            .map_err(ClusterError::nats("read the answer to the revocations"))?;
         match answer["data"]["code"].as_u64() {
             Some(200) => Ok(()),
-            _ => Err(ClusterError::nats("tell what is revoked")(answer)),
+            _ => Err(ClusterError::nats("send the revocations")(answer)),
         }
     }
 
@@ -266,12 +271,12 @@ impl Authority {
     }
 }
 
-/// What the workers of a pool may publish: to the hub, in their name; requests for their own tiles and
-/// inputs; the frames that they made.
+/// Lists the subjects to which the workers of a pool may publish: messages to the hub, requests for the pool's tiles
+/// and inputs, acknowledgements and frames.
 fn worker_may_publish(pool: &Pool) -> Vec<String> {
     let (tasks, inputs) = (names::TASKS, names::INPUTS);
-    let asks = ["hello", "begin", "beat", "want"].map(|what| names::ask(what, pool));
-    let mut subjects = asks.to_vec();
+    let mut subjects =
+        ["hello", "begin", "beat", "want"].map(|kind| names::ask(kind, pool)).to_vec();
     subjects.extend([
         names::event(pool),
         format!("sci.v1.out.{pool}.>"),
@@ -283,7 +288,7 @@ fn worker_may_publish(pool: &Pool) -> Vec<String> {
     subjects
 }
 
-/// An account without limits, with streams or without.
+/// Limits of an account: none, except that it may be denied streams.
 fn limits(streams: bool) -> Value {
     let storage = if streams { -1 } else { 0 };
     json!({
@@ -317,7 +322,7 @@ fn write_user(
     )
 }
 
-/// A token about `subject`, signed by `issuer`.
+/// Makes a token about `subject`, signed by `issuer`.
 fn token(
     issuer: &KeyPair,
     subject: &str,
@@ -341,7 +346,7 @@ fn token(
     Ok(format!("{text}.{}", URL_SAFE_NO_PAD.encode(signature)))
 }
 
-/// Writes a file that its owner alone may read, and brings it to its place at once.
+/// Writes a file that only its owner may read. It replaces an earlier file in one step.
 pub fn write_secret(path: &Path, text: &str) -> Result<(), ClusterError> {
     let mut draft = path.as_os_str().to_owned();
     draft.push(".new");

@@ -1,5 +1,5 @@
-//! Files in a stream, in chunks that fit into a message. The first chunk comes last: it marks a whole
-//! file. What was received is believed only if it has the hash that was promised.
+//! Files in a stream, in chunks that fit into a message. The first chunk is written last: it marks a complete file.
+//! A received file is accepted only if it has the stated hash.
 
 use std::pin::pin;
 
@@ -12,18 +12,18 @@ use super::message::Input;
 use super::names;
 use engine::job::Sha256;
 
-/// Bytes of a chunk: below the default limit of a message, with room for its headers.
+/// Bytes of a chunk: below the default limit of a message, 1 MiB, with room for its headers.
 const CHUNK: usize = 512 * 1024;
-/// Chunks under way at a time.
+/// Chunks in flight at a time.
 const AT_ONCE: usize = 4;
 
-/// Why a file is not to be had.
+/// Reason for which a file can't be fetched.
 #[derive(Debug, thiserror::Error)]
 pub enum BlobError {
-    /// A chunk is not there, or not yet.
+    /// The stream has no such chunk, or a replica does not have it yet.
     #[error("a chunk is missing")]
     Missing,
-    /// The bytes are others.
+    /// The bytes do not have the stated length or hash.
     #[error("its bytes are not those that were sent")]
     Damaged,
     /// The stream can't be read.
@@ -35,7 +35,7 @@ impl Connection {
     /// Puts a file under `prefix`, a subject of a stream.
     ///
     /// # Errors
-    /// If the stream takes no more, or has no quorum.
+    /// If the stream is full, or has no quorum.
     pub(super) async fn put(&self, prefix: &str, bytes: Bytes) -> Result<(), ClusterError> {
         let count = chunks(bytes.len());
         let rest = stream::iter((1..count).map(|n| self.put_chunk(prefix, &bytes, n)));
@@ -60,19 +60,19 @@ impl Connection {
         prefix: &str,
         wanted: Input,
     ) -> Result<Vec<u8>, BlobError> {
-        // Memory grows with what arrives, not with what was promised.
+        // Memory grows with the bytes that arrive; the stated size may be wrong.
         let mut bytes = Vec::new();
         let mut chunks = pin!(self.chunks(stream, prefix, wanted.bytes, 0));
         while let Some(chunk) = chunks.try_next().await? {
             bytes.extend_from_slice(&chunk);
         }
         let hashed = tokio::task::spawn_blocking(move || (Sha256::of(&bytes), bytes)).await;
-        let (found, bytes) = hashed.map_err(|error| BlobError::Failed(error.to_string()))?;
-        if found == wanted.sha256 { Ok(bytes) } else { Err(BlobError::Damaged) }
+        let (sha256, bytes) = hashed.map_err(|error| BlobError::Failed(error.to_string()))?;
+        if sha256 == wanted.sha256 { Ok(bytes) } else { Err(BlobError::Damaged) }
     }
 
-    /// Gets the chunks of a file in their order, from number `first` on; `bytes` is the size of the file. A chunk
-    /// whose length does not match its place in the file is [`BlobError::Damaged`]. The caller checks the hash.
+    /// Gets the chunks of a file in order, starting at number `first`. `bytes` is the size of the file. A chunk with a
+    /// wrong length is [`BlobError::Damaged`]. The caller checks the hash.
     pub(super) fn chunks(
         &self,
         stream: &str,
@@ -90,9 +90,9 @@ impl Connection {
     }
 
     async fn get_chunk(&self, stream: &str, subject: String) -> Result<Bytes, BlobError> {
-        let found = self.context.get_stream_no_info(stream).await;
-        let found = found.map_err(|error| BlobError::Failed(error.to_string()))?;
-        let message = found.direct_get_last_for_subject(subject).await;
+        let stream = self.context.get_stream_no_info(stream).await;
+        let stream = stream.map_err(|error| BlobError::Failed(error.to_string()))?;
+        let message = stream.direct_get_last_for_subject(subject).await;
         message.map(|message| message.payload).map_err(|error| match error.kind() {
             DirectGetErrorKind::NotFound => BlobError::Missing,
             _ => BlobError::Failed(error.to_string()),
@@ -105,18 +105,18 @@ impl Connection {
     /// If the server refuses, or has no quorum.
     pub(super) async fn purge(&self, stream: &str, subjects: String) -> Result<(), ClusterError> {
         let failed = ClusterError::nats("purge a stream");
-        let found = self.context.get_stream_no_info(stream).await;
-        let found = found.map_err(ClusterError::nats("find a stream"))?;
-        let purged = found.purge().filter(subjects).await;
+        let stream = self.context.get_stream_no_info(stream).await;
+        let stream = stream.map_err(ClusterError::nats("find a stream"))?;
+        let purged = stream.purge().filter(subjects).await;
         purged.map(|_| ()).map_err(failed)
     }
 
-    /// Removes a message of a tile; that it is gone already is no error.
+    /// Removes a message of a tile. A message that was already removed is not an error.
     pub(super) async fn drop_task(&self, seq: i64) {
         if let Ok(stream) = self.context.get_stream_no_info(names::TASKS).await
             && let Err(error) = stream.delete_message(seq.cast_unsigned()).await
         {
-            tracing::debug!(%error, seq, "a message is not there to be removed");
+            tracing::debug!(%error, seq, "a message can't be removed");
         }
     }
 }

@@ -1,5 +1,5 @@
-//! A worker's cache: files named by the hash of their bytes, in one folder, within a bound. What was
-//! not used for longest goes first.
+//! A worker's cache: one folder of limited size, with files named by the hash of their bytes. The least recently used
+//! file is removed first.
 
 use std::collections::HashMap;
 use std::fs;
@@ -11,24 +11,31 @@ use super::connection::ClusterError;
 use engine::job::Sha256;
 use store::LockedFile;
 
-/// A folder of files that can be had again.
+/// A folder of files that can be fetched again.
 #[derive(Debug)]
 pub struct Cache {
     folder: PathBuf,
-    /// The most bytes that it may hold.
+    /// Limit of the total size in bytes.
     limit: u64,
-    /// Of each file its size and its turn: the higher, the later it was used.
-    files: HashMap<Sha256, (u64, u64)>,
-    turn: u64,
-    /// Locked as long as this lives.
+    files: HashMap<Sha256, CachedFile>,
+    /// Number of uses so far.
+    uses: u64,
+    /// Reserves the folder for this cache until it is dropped.
     _lock: LockedFile,
 }
 
+#[derive(Debug, Clone, Copy)]
+struct CachedFile {
+    bytes: u64,
+    /// Value of [`Cache::uses`] at the last use.
+    last_use: u64,
+}
+
 impl Cache {
-    /// Opens a folder, which is made if it is missing. Files in it that are not the cache's stay.
+    /// Opens a folder, and creates it if it is missing. Files of other origin remain untouched.
     ///
     /// # Errors
-    /// If it can't be made or read, or if another worker has it: that one would remove what this one needs.
+    /// If it can't be created or read, or if another worker uses it: each would remove files that the other needs.
     pub fn open(folder: &Path, limit: u64) -> Result<Self, ClusterError> {
         let failed = |error: io::Error| ClusterError::Cache {
             path: folder.display().to_string(),
@@ -39,58 +46,58 @@ impl Cache {
         let lock = LockedFile::take(lock).map_err(|error| match error {
             fs::TryLockError::Error(error) => failed(error),
             fs::TryLockError::WouldBlock => failed(io::Error::other(
-                "it is another worker's; give each worker a folder of its own (--cache)",
+                "another worker uses it; give each worker a separate folder (--cache)",
             )),
         })?;
-        let mut found = Vec::new();
+        let mut files = Vec::new();
         for entry in fs::read_dir(folder).map_err(failed)? {
             let entry = entry.map_err(failed)?;
             let name = entry.file_name().to_string_lossy().into_owned();
             if let Some(draft) = name.strip_suffix(DRAFT)
                 && draft.parse::<Sha256>().is_ok()
             {
-                // A worker that was killed has left it.
+                // A killed worker has left an unfinished file.
                 fs::remove_file(entry.path()).map_err(failed)?;
             } else if let Ok(sha256) = name.parse::<Sha256>() {
-                let facts = entry.metadata().map_err(failed)?;
-                let used = facts.modified().unwrap_or(SystemTime::UNIX_EPOCH);
-                found.push((used, sha256, facts.len()));
+                let metadata = entry.metadata().map_err(failed)?;
+                let used = metadata.modified().unwrap_or(SystemTime::UNIX_EPOCH);
+                files.push((used, sha256, metadata.len()));
             }
         }
-        found.sort_unstable_by_key(|(used, ..)| *used);
+        files.sort_unstable_by_key(|(used, ..)| *used);
         let folder = folder.to_owned();
-        let mut cache = Self { folder, limit, files: HashMap::new(), turn: 0, _lock: lock };
-        for (_, sha256, size) in found {
-            cache.note(sha256, size);
+        let mut cache = Self { folder, limit, files: HashMap::new(), uses: 0, _lock: lock };
+        for (_, sha256, bytes) in files {
+            cache.record_use(sha256, bytes);
         }
         cache.make_room(0, &[]).map_err(failed)?;
         Ok(cache)
     }
 
-    /// Where a file is, or would be.
+    /// The path of a file, which may not be in the cache.
     pub fn path(&self, sha256: Sha256) -> PathBuf {
         self.folder.join(sha256.to_string())
     }
 
-    /// Whether a file is there, with the bytes that it should have; one that is damaged is removed.
+    /// True if the cache has the file and its bytes are intact. A damaged file is removed.
     pub fn has(&mut self, sha256: Sha256) -> bool {
         let path = self.path(sha256);
         let hashed = fs::File::open(&path).and_then(|mut file| Sha256::of_reader(&mut file));
         match hashed {
-            Ok((found, size)) if found == sha256 => {
-                self.note(sha256, size);
+            Ok((actual, bytes)) if actual == sha256 => {
+                self.record_use(sha256, bytes);
                 true
             }
             _ => {
                 self.files.remove(&sha256);
-                // It may not be there at all.
+                // The file may not exist.
                 let _ = fs::remove_file(path);
                 false
             }
         }
     }
 
-    /// Adds a file. Those in `needed` stay.
+    /// Adds a file. Files in `needed` are not removed to make room.
     ///
     /// # Errors
     /// If it is too large for the cache, or the disk fails.
@@ -101,26 +108,26 @@ impl Cache {
         let draft = self.folder.join(format!("{sha256}{DRAFT}"));
         fs::write(&draft, bytes)?;
         fs::rename(draft, path)?;
-        self.note(sha256, size);
+        self.record_use(sha256, size);
         Ok(())
     }
 
-    fn note(&mut self, sha256: Sha256, size: u64) {
-        self.turn += 1;
-        self.files.insert(sha256, (size, self.turn));
+    fn record_use(&mut self, sha256: Sha256, bytes: u64) {
+        self.uses += 1;
+        self.files.insert(sha256, CachedFile { bytes, last_use: self.uses });
     }
 
     fn make_room(&mut self, size: u64, needed: &[Sha256]) -> io::Result<()> {
         loop {
-            let held: u64 = self.files.values().map(|(size, _)| size).sum();
-            if held + size <= self.limit {
+            let total: u64 = self.files.values().map(|file| file.bytes).sum();
+            if total + size <= self.limit {
                 return Ok(());
             }
-            let free = self.files.iter().filter(|(sha256, _)| !needed.contains(sha256));
-            let Some((&oldest, _)) = free.min_by_key(|(_, (_, turn))| *turn) else {
+            let removable = self.files.iter().filter(|(sha256, _)| !needed.contains(sha256));
+            let Some((&oldest, _)) = removable.min_by_key(|(_, file)| file.last_use) else {
                 return Err(io::Error::other(format!(
-                    "one tile needs more than the {} bytes that the cache may hold: set a larger \
-                     --cache-bytes",
+                    "one tile needs more than the {} bytes that the cache may use: set a larger \
+            --cache-bytes",
                     self.limit
                 )));
             };
@@ -133,9 +140,9 @@ impl Cache {
     }
 }
 
-/// The end of the name of a file that is being written.
+/// Suffix of a file that is being written.
 const DRAFT: &str = ".part";
-/// The file whose lock says that a worker has the folder.
+/// A worker that uses the folder holds a lock on this file.
 const LOCK: &str = "lock";
 
 #[cfg(test)]
@@ -149,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bound_holds_and_what_was_used_last_stays() {
+    fn the_limit_holds_and_the_least_recently_used_file_is_removed() {
         let folder = tempfile::tempdir().unwrap();
         let files: Vec<Vec<u8>> = (0..5).map(|n| vec![n; 100]).collect();
         let names: Vec<Sha256> = files.iter().map(|bytes| Sha256::of(bytes)).collect();
@@ -166,11 +173,11 @@ mod tests {
         let refused = cache.add(names[1], &files[1], &names).unwrap_err().to_string();
         assert!(refused.contains("--cache-bytes"), "{refused}");
 
-        let taken = Cache::open(folder.path(), 200).unwrap_err().to_string();
-        assert!(taken.contains("another worker's"), "{taken}");
+        let refused = Cache::open(folder.path(), 200).unwrap_err().to_string();
+        assert!(refused.contains("another worker uses it"), "{refused}");
         drop(cache);
         let mut again = Cache::open(folder.path(), 200).unwrap();
-        assert_eq!(sizes(folder.path()), 200, "the bound may have become smaller");
+        assert_eq!(sizes(folder.path()), 200, "a smaller limit applies to files that exist");
         std::fs::write(again.path(names[4]), "other bytes").unwrap();
         assert!(!again.has(names[4]), "damaged");
         assert!(!again.path(names[4]).exists());

@@ -1,4 +1,4 @@
-//! What is missing for a server, or for a worker, said in words.
+//! The checks of `sci-recon cluster check`: they report what a server or a worker lacks.
 
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
@@ -10,25 +10,25 @@ use super::message::{Hello, HelloAnswer, Input, Program};
 use super::names;
 use engine::job::{Pool, Sha256, TaskId, WorkerId};
 
-/// Bytes of a window as they are common: 10 frames of about 330x330 pixels.
+/// Bytes of a typical window: 10 frames of about 330x330 pixels.
 const WINDOW: usize = 4_400_000;
-/// Payload of a message that chunks need, with headers.
+/// Largest message in bytes that the transfer of files needs: a chunk of 512 KiB with headers.
 const PAYLOAD: usize = 600_000;
-/// The first version of nats-server in which work queues keep what they should.
+/// First version of nats-server without known losses in work queues.
 const RECOMMENDED: (i64, i64, i64) = (2, 12, 5);
-/// The oldest that was tried.
+/// Oldest version that was tested.
 const OLDEST: (i64, i64, i64) = (2, 9, 10);
-/// The largest difference of clocks that does no harm to what people read.
+/// Largest difference of clocks that does not confuse the times that people read.
 const CLOCKS: Duration = Duration::from_secs(2);
 
-/// Something that was looked at.
+/// The result of one check.
 #[derive(Debug)]
 pub struct Check {
-    /// What.
+    /// The subject of the check.
     pub what: &'static str,
-    /// Whether it will do.
+    /// True if the check has passed.
     pub good: bool,
-    /// What was found.
+    /// The observation, for people.
     pub found: String,
 }
 
@@ -48,10 +48,10 @@ impl Check {
         }
     }
 
-    /// Looks at all that a server needs or, with the credential of a pool, a worker of it that is this program.
+    /// Checks what a server needs. With the credential of a pool, it checks what a worker of the pool needs.
     ///
     /// # Errors
-    /// If no message server can be reached at all.
+    /// If no message server can be reached.
     pub async fn run(
         urls: Option<&str>,
         credential: Option<&Path>,
@@ -91,10 +91,10 @@ fn version(connection: &Connection) -> Check {
 }
 
 fn payload(connection: &Connection) -> Check {
-    let found = connection.client.max_payload();
-    let good = found >= PAYLOAD;
+    let limit = connection.client.max_payload();
+    let good = limit >= PAYLOAD;
     let hint = if good { String::new() } else { format!(": set max_payload to {PAYLOAD} or more") };
-    Check::new("payload of a message", good, format!("{found} bytes{hint}"))
+    Check::new("payload of a message", good, format!("{limit} bytes{hint}"))
 }
 
 async fn round_trip(connection: &Connection) -> Check {
@@ -110,11 +110,11 @@ async fn round_trip(connection: &Connection) -> Check {
     Check::new("round trip", true, format!("{:.1} ms", times[2].as_secs_f64() * 1e3))
 }
 
-/// What `sci-recon serve` needs.
+/// Checks what `sci-recon serve` needs.
 async fn server(connection: &Connection) -> Vec<Check> {
-    let made = connection.make_streams().await;
+    let streams = connection.make_streams().await;
     let mut checks =
-        vec![Check::of("streams", made, |_| "there, with the right to change them".into())];
+        vec![Check::of("streams", streams, |_| "exist, with the right to change them".into())];
     if checks.iter().any(|check| !check.good) {
         return checks;
     }
@@ -123,8 +123,8 @@ async fn server(connection: &Connection) -> Vec<Check> {
             let info = found.cached_info();
             let copies = info.config.num_replicas;
             let nodes = info.cluster.as_ref().map_or(1, |cluster| 1 + cluster.replicas.len());
-            let late = info.cluster.iter().flat_map(|cluster| &cluster.replicas);
-            let late = late.filter(|peer| !peer.current).count();
+            let replicas = info.cluster.iter().flat_map(|cluster| &cluster.replicas);
+            let late = replicas.filter(|peer| !peer.current).count();
             let text = format!("{copies} copies on {nodes} nodes, {late} of them late");
             checks.push(Check::new(name, late == 0, text));
         }
@@ -133,7 +133,7 @@ async fn server(connection: &Connection) -> Vec<Check> {
     checks
 }
 
-/// Puts a window and gets it again; and looks at the clock of the message server on the way.
+/// Sends a window and fetches it. Also compares the clock with the message server's.
 async fn throughput(connection: &Connection) -> Vec<Check> {
     let bytes: Vec<u8> = (0..WINDOW).map(|n| (n.wrapping_mul(2_654_435_761) >> 13) as u8).collect();
     let input = Input { sha256: Sha256::of(&bytes), bytes: WINDOW as u64 };
@@ -149,7 +149,7 @@ async fn throughput(connection: &Connection) -> Vec<Check> {
     let start = Instant::now();
     let mut got = connection.get(names::INPUTS, &prefix, input).await;
     if got.is_err() {
-        // A replica may be late.
+        // A replica may lag.
         tokio::time::sleep(Duration::from_millis(500)).await;
         got = connection.get(names::INPUTS, &prefix, input).await;
     }
@@ -168,7 +168,7 @@ async fn clocks(connection: &Connection, subject: &str) -> Check {
         Ok(stream) => stream,
         Err(error) => return Check::new(what, false, error.to_string()),
     };
-    // A message that was stored a moment ago; how long ago at most is known.
+    // The server's time of this message must lie between the two local times.
     let before = SystemTime::now();
     let sent = connection.context.publish(subject.to_owned(), Bytes::from_static(b"now")).await;
     if let Err(error) = sent.map_err(ClusterError::nats("put")) {
@@ -182,13 +182,14 @@ async fn clocks(connection: &Connection, subject: &str) -> Check {
             let time: SystemTime = message.time.into();
             let early = before.duration_since(time).unwrap_or_default();
             let late = time.duration_since(after).unwrap_or_default();
-            let off = early.max(late);
-            Check::new(what, off <= CLOCKS, format!("{:.1} s apart", off.as_secs_f64()))
+            let difference = early.max(late);
+            let text = format!("{:.1} s apart", difference.as_secs_f64());
+            Check::new(what, difference <= CLOCKS, text)
         }
     }
 }
 
-/// What a worker of a pool needs.
+/// Checks what a worker of a pool needs.
 async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<Check> {
     let worker = WorkerId::new();
     let hello = Hello {
@@ -202,7 +203,7 @@ async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<C
     let consumer = connection.pool(pool).await;
     checks.push(Check::of("the pool's tiles", consumer, |consumer| {
         let info = consumer.cached_info();
-        format!("{} wait, {} are out", info.num_pending, info.num_ack_pending)
+        format!("{} waiting, {} in progress", info.num_pending, info.num_ack_pending)
     }));
     let prefix = names::output(pool, TaskId::new(), 0, worker);
     let bytes = vec![7; WINDOW];
@@ -212,7 +213,7 @@ async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<C
         let seconds = start.elapsed().as_secs_f64();
         format!("4.4 MB in {:.0} ms, {:.0} MB/s", seconds * 1e3, WINDOW as f64 / 1e6 / seconds)
     }));
-    // Nothing is there under this name; that this can be said is a right.
+    // No input has this name. A worker without the right to read gets a different error.
     let absent = Input { sha256: Sha256::of(b"nothing"), bytes: 1 };
     let got = connection.get(names::INPUTS, &names::input(pool, absent.sha256), absent).await;
     checks.push(match got {
@@ -238,8 +239,8 @@ async fn welcome(connection: &Connection, pool: &Pool, hello: &Hello) -> Check {
         Ok(answer) => match serde_json::from_slice(&answer.payload) {
             Ok(HelloAnswer::Welcome { .. }) => {
                 let leave = super::message::Beat { worker: hello.worker, tile: None, leaves: true };
-                // It is forgotten by itself otherwise.
-                let _ = connection.say(names::ask("beat", pool), &leave).await;
+                // If this fails, the hub drops the worker after a while.
+                let _ = connection.publish(names::ask("beat", pool), &leave).await;
                 Check::new(what, true, "the server takes workers of this version")
             }
             Ok(HelloAnswer::Refused(reason)) => Check::new(what, false, reason),

@@ -1,4 +1,4 @@
-//! Configurations of the message server: one for each node.
+//! Writes configurations of the message server, one for each node.
 
 use std::fmt;
 use std::fs;
@@ -11,7 +11,7 @@ use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair, 
 use super::authority::{Authority, at, write_secret};
 use super::connection::ClusterError;
 
-/// The port at which nodes meet each other lies so far above that for clients.
+/// Offset from a node's port for clients to its port for other nodes.
 const ROUTES: u16 = 2000;
 const CERTIFICATE: &str = "server.pem";
 const KEY: &str = "server.key";
@@ -29,14 +29,14 @@ impl FromStr for ServerVersion {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("{text:?} is no version of nats-server; one is 2.12 or 2.12.5");
+        let wrong = || format!("{text:?} is not a version of nats-server such as 2.12 or 2.12.5");
         let mut version = [0; 3];
         let parts: Vec<&str> = text.trim_start_matches('v').split('.').collect();
         if !(2..=3).contains(&parts.len()) {
             return Err(wrong());
         }
-        for (place, part) in version.iter_mut().zip(parts) {
-            *place = part.parse().map_err(|_| wrong())?;
+        for (number, part) in version.iter_mut().zip(parts) {
+            *number = part.parse().map_err(|_| wrong())?;
         }
         Ok(Self(version))
     }
@@ -49,7 +49,7 @@ impl fmt::Display for ServerVersion {
     }
 }
 
-/// A node of the message server: its host as others reach it, and its port.
+/// A node of the message server: the host name that others use, and the port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Node {
     host: String,
@@ -60,7 +60,8 @@ impl FromStr for Node {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("{text:?} is no host, and no host:port with a port below 63536");
+        let wrong =
+            || format!("{text:?} is neither a host nor a host:port with a port below 63536");
         let (host, port) = match text.rsplit_once(':') {
             Some((host, port)) => (host, port.parse().map_err(|_| wrong())?),
             None => (text, 4222),
@@ -73,12 +74,12 @@ impl FromStr for Node {
     }
 }
 
-/// What was made, and what is to be known of it.
+/// The configurations that were written, and warnings about them.
 #[derive(Debug)]
 pub struct Configured {
     /// A configuration for each node.
     pub files: Vec<PathBuf>,
-    /// What could not be had.
+    /// Properties that the configurations lack.
     pub warnings: Vec<String>,
 }
 
@@ -90,10 +91,10 @@ pub fn url(nodes: &[Node], tls: bool) -> String {
     nodes.iter().map(one).collect::<Vec<_>>().join(",")
 }
 
-/// Makes the certificates, so that [`Authority::create_worker`] finds them.
+/// Writes the certificates, which [`Authority::create_worker`] then adds to credentials.
 ///
 /// # Errors
-/// If they can't be made or written.
+/// If they can't be generated or written.
 pub fn make_certificates(folder: &Path, nodes: &[Node]) -> Result<(), ClusterError> {
     let failed = at(folder);
     let mut authority = CertificateParams::default();
@@ -108,18 +109,18 @@ pub fn make_certificates(folder: &Path, nodes: &[Node]) -> Result<(), ClusterErr
     let server_key = KeyPair::generate().map_err(&failed)?;
     let issuer = Issuer::new(authority, authority_key);
     let certificate = server.signed_by(&server_key, &issuer).map_err(&failed)?;
-    // Nobody needs the authority's key again: another certificate comes with another authority.
+    // The authority's key is dropped: a new certificate gets a new authority.
     fs::write(folder.join(AUTHORITY), signed.pem()).map_err(at(folder))?;
     fs::write(folder.join(CERTIFICATE), certificate.pem()).map_err(at(folder))?;
     write_secret(&folder.join(KEY), &server_key.serialize_pem())
 }
 
-/// Writes the configuration of each node into the folder of the keys. `store` is the folder for
-/// messages on the node's machine, `bytes` the most in it. `version` is that of the nodes' nats-server; without it
-/// they are taken to have the one of this machine, or a current one.
+/// Writes the configuration of each node into the folder of the keys. `store` is the folder for messages on the
+/// node's machine, and `bytes` limits its size. `version` is the nodes' version of nats-server. The default is the
+/// version on this machine, or a current one if there is none.
 ///
 /// # Errors
-/// If they can't be written, or nats-server, where it is there, does not take them.
+/// If they can't be written, or a nats-server on this machine rejects them.
 pub fn write(
     authority: &Authority,
     folder: &Path,
@@ -132,8 +133,8 @@ pub fn write(
     let store = &std::path::absolute(store).map_err(at(store))?;
     let secret = hex::encode(rand::random::<[u8; 16]>());
     let (mut files, mut warnings) = (Vec::new(), Vec::new());
-    let here = find_server().and_then(|path| Some((version_of(&path)?, path)));
-    let version = version.or(here.as_ref().map(|(version, _)| *version));
+    let installed = find_server().and_then(|path| Some((version_of(&path)?, path)));
+    let version = version.or(installed.as_ref().map(|(version, _)| *version));
     let sync = version.is_none_or(|version| version >= SYNC_ALWAYS);
     for (n, node) in nodes.iter().enumerate() {
         let name = if nodes.len() > 1 {
@@ -153,22 +154,23 @@ pub fn write(
             sync,
         )?;
         write_secret(&path, &text)?;
-        // An older server than the nodes' may refuse what they know.
-        if let Some((_, server)) = here.as_ref().filter(|(here, _)| !sync || *here >= SYNC_ALWAYS) {
+        // A server that is older than the nodes' may reject options that they know.
+        let tester = installed.as_ref().filter(|(installed, _)| !sync || *installed >= SYNC_ALWAYS);
+        if let Some((_, server)) = tester {
             test(server, &path).map_err(|reason| at(&path)(reason))?;
         }
         files.push(path);
     }
     match version {
         Some(version) if !sync => warnings.push(format!(
-            "nats-server {version} does not know `sync_interval: always`: after a power cut up to two minutes of \
-             messages may be gone, which the server finds and mends. 2.12.5 or later is recommended; where the \
-             nodes have another version than this machine, name it with --nats-version"
+            "nats-server {version} does not know `sync_interval: always`: a power cut may lose up to two minutes of \
+            messages, which the server detects and repairs. 2.12.5 or later is recommended. If the nodes have \
+            another version than this machine, state it with --nats-version"
         )),
         Some(_) => {}
         None => warnings.push(
-            "there is no nats-server on this machine to try the configuration with; it is for 2.10 or later, \
-             unless --nats-version names an older one"
+            "this machine has no nats-server to test the configuration with; it is for version 2.10 or later \
+            unless --nats-version states an older one"
                 .into(),
         ),
     }
@@ -200,7 +202,7 @@ fn text(
         folder.join(AUTHORITY)
     );
     let client_tls = if tls.is_some() { certificates.as_str() } else { "" };
-    // A node that is reached on its own machine alone listens there alone.
+    // A node on a loopback address listens only on that address.
     let local = node.host.parse::<std::net::IpAddr>().is_ok_and(|address| address.is_loopback());
     let listen = if local { node.host.as_str() } else { "0.0.0.0" };
     let mut text = format!(
@@ -234,33 +236,33 @@ fn text(
     Ok(text)
 }
 
-/// nats-server on this machine.
+/// Finds nats-server on this machine.
 fn find_server() -> Option<PathBuf> {
     let named = std::env::var_os("NATS_SERVER").map(PathBuf::from);
     let path = std::env::var_os("PATH").unwrap_or_default();
     let mut folders: Vec<PathBuf> = std::env::split_paths(&path).collect();
     folders.extend(["/usr/sbin", "/usr/local/bin"].map(PathBuf::from));
-    let found = folders.into_iter().map(|folder| folder.join("nats-server"));
-    named.into_iter().chain(found).find(|path| path.is_file())
+    let candidates = folders.into_iter().map(|folder| folder.join("nats-server"));
+    named.into_iter().chain(candidates).find(|path| path.is_file())
 }
 
-/// The version of a nats-server; none if it does not say one.
+/// Runs a nats-server to get its version. Returns `None` if it prints none.
 fn version_of(server: &Path) -> Option<ServerVersion> {
     let ran = Command::new(server).arg("--version").output().ok()?;
-    let said = String::from_utf8(ran.stdout).ok()?;
-    // A version before its release has more behind a dash.
-    said.rsplit(": ").next()?.trim().split('-').next()?.parse().ok()
+    let output = String::from_utf8(ran.stdout).ok()?;
+    // A pre-release has a suffix after a dash.
+    output.rsplit(": ").next()?.trim().split('-').next()?.parse().ok()
 }
 
-/// Has nats-server read a configuration; the reason if it does not take it.
+/// Tests a configuration with nats-server. The error is its output.
 fn test(server: &Path, path: &Path) -> Result<(), String> {
     let ran = Command::new(server).arg("-t").arg("-c").arg(path).output();
     let ran = ran.map_err(|error| error.to_string())?;
     if ran.status.success() {
         return Ok(());
     }
-    let said = [ran.stdout, ran.stderr].concat();
-    Err(String::from_utf8_lossy(&said).trim().to_owned())
+    let output = [ran.stdout, ran.stderr].concat();
+    Err(String::from_utf8_lossy(&output).trim().to_owned())
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! How to reach the message server, and as whom.
+//! Credentials for the message server, and connections to it.
 
 use std::io::Write;
 use std::path::Path;
@@ -15,30 +15,30 @@ use tempfile::NamedTempFile;
 
 use engine::job::Pool;
 
-/// How long the server may take to answer.
+/// Timeout of requests to the server.
 const ANSWER: Duration = Duration::from_secs(5);
-/// Time between two signs of life of a connection; after two without an answer it is made anew.
+/// Time between two pings. After two without an answer, the client reconnects.
 const PING: Duration = Duration::from_secs(5);
-/// The longest pause between two tries to connect.
-const PAUSE: Duration = Duration::from_secs(2);
+/// Longest pause between two attempts to connect.
+const MAX_PAUSE: Duration = Duration::from_secs(2);
 
-/// Refusals in a row after which a credential is taken for revoked; a server that has just started may not know
-/// all credentials yet.
+/// Consecutive refusals after which a credential counts as revoked. A server that has just started may not know all
+/// credentials yet.
 const REFUSALS: u32 = 3;
 
-/// Why the cluster can't be worked with.
+/// Failure of the message server, its credentials or its configuration.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // the messages say it
+#[allow(missing_docs)] // the messages describe the variants
 pub enum ClusterError {
-    #[error("{what} is no address of a NATS server ({reason}); one is nats://host:4222")]
+    #[error("{what} is not an address of a NATS server such as nats://host:4222 ({reason})")]
     Address { what: String, reason: String },
     #[error("the credential {path}: {reason}")]
     Credential { path: String, reason: String },
     #[error("no NATS server answers at {url}: {reason}")]
     Unreachable { url: String, reason: String },
     #[error(
-        "the NATS server at {url} refuses the credential (authorization violation): it is missing, revoked, past its \
-         end, or of another cluster; `sci-recon cluster worker list` shows which are good"
+        "the NATS server at {url} refuses the credential (authorization violation): it is missing, revoked, expired, \
+        or belongs to another cluster; `sci-recon cluster worker list` shows the valid ones"
     )]
     Unauthorized { url: String },
     #[error("NATS: can't {action}: {reason}")]
@@ -52,23 +52,23 @@ pub enum ClusterError {
 }
 
 impl ClusterError {
-    /// An error of the message server, while something was tried; for `map_err`.
+    /// Wraps an error of the message server during `action`; for `map_err`.
     pub fn nats<E: std::fmt::Display>(action: &'static str) -> impl Fn(E) -> Self {
         move |error| Self::Nats { action, reason: error.to_string() }
     }
 }
 
-/// What a credential file holds beside the key: see `sci-recon cluster worker create`.
+/// The content of a credential file. `sci-recon cluster worker create` writes it.
 #[derive(Debug, Default)]
 pub struct Credential {
-    /// The lines before the key: the address, the pool.
+    /// The address of the message server.
     url: Option<String>,
     pool: Option<Pool>,
-    /// The prefix of the subjects of answers, which the rights name.
+    /// Prefix of the subjects to which the user may receive answers.
     inbox: Option<String>,
-    /// The certificate of the authority that the server is trusted by, as PEM.
+    /// The certificate of the authority that signed the server's certificate, as PEM.
     authority: Option<String>,
-    /// The whole text, in which NATS finds its token and key.
+    /// The complete text, from which the NATS client reads token and key.
     text: String,
 }
 
@@ -83,54 +83,53 @@ impl Credential {
             ClusterError::Credential { path, reason }
         };
         let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
-        let line = |name: &str| {
-            let mut found =
+        let field = |name: &str| {
+            let mut values =
                 text.lines().filter_map(|line| line.strip_prefix(name)?.strip_prefix(": "));
-            found.next().map(|value| value.trim().to_owned())
+            values.next().map(|value| value.trim().to_owned())
         };
-        let pool = line("pool").map(|name| name.parse()).transpose();
+        let pool = field("pool").map(|name| name.parse()).transpose();
         let pool = pool.map_err(|error: engine::job::InvalidPool| wrong(error.to_string()))?;
         let authority = text.find("-----BEGIN CERTIFICATE-----").and_then(|start| {
             let mark = "-----END CERTIFICATE-----\n";
             let end = text.rfind(mark)? + mark.len();
             Some(text.get(start..end)?.to_owned())
         });
-        Ok(Self { url: line("url"), pool, inbox: line("inbox"), authority, text })
+        Ok(Self { url: field("url"), pool, inbox: field("inbox"), authority, text })
     }
 
-    /// The pool that it is for, if it says so.
+    /// The pool that the file names.
     pub fn pool(&self) -> Option<&Pool> {
         self.pool.as_ref()
     }
 }
 
-/// Where the message server is, and as whom one comes.
+/// Addresses of the message server, and the credential for it.
 #[derive(Debug, Clone)]
 pub struct Access {
-    /// As they were given, separated by commas.
+    /// The addresses as the user wrote them, separated by commas.
     urls: String,
     servers: Vec<ServerAddr>,
     options: ConnectOptions,
-    /// The file from which NATS reads the authority's certificate, at each new connection.
+    /// The authority's certificate. The NATS client reads this file at each new connection.
     authority: Option<Arc<NamedTempFile>>,
-    /// Tries in a row in which the server has refused the credential.
+    /// Consecutive attempts at which the server has refused the credential.
     refusals: Arc<AtomicU32>,
 }
 
 impl Access {
-    /// To the servers in `urls`, which are separated by commas; where there are none, to those that the
-    /// credential names. Nothing is connected yet.
+    /// Access to the servers in `urls`, separated by commas, or to those that the credential names. Does not connect.
     ///
     /// # Errors
-    /// Addresses or a credential that can't be.
+    /// If an address or the credential is invalid, or no address is known.
     pub fn new(
         urls: Option<&str>,
         credential: &Credential,
         name: &str,
     ) -> Result<Self, ClusterError> {
         let urls = urls.or(credential.url.as_deref()).ok_or_else(|| ClusterError::Address {
-            what: "nothing".into(),
-            reason: "neither --nats nor the credential names one".into(),
+            what: "the empty text".into(),
+            reason: "neither --nats nor the credential names an address".into(),
         })?;
         let servers: Result<Vec<ServerAddr>, ClusterError> = urls
             .split(',')
@@ -149,14 +148,14 @@ impl Access {
             .ping_interval(PING)
             .connection_timeout(ANSWER)
             .request_timeout(Some(ANSWER))
-            // A large history in a beat does not wait for the loop that reads.
+            // Allows a burst of messages before the loop that reads them catches up.
             .subscription_capacity(16_384)
             .reconnect_delay_callback(|tries| {
-                PAUSE.min(Duration::from_millis(50 * u64::try_from(tries).unwrap_or(40)))
+                MAX_PAUSE.min(Duration::from_millis(50 * u64::try_from(tries).unwrap_or(40)))
             })
             .event_callback(move |event| {
                 count_refusals(&counted, &event);
-                async move { tell(&event) }
+                async move { log(&event) }
             });
         if let Some(inbox) = &credential.inbox {
             options = options.custom_inbox_prefix(inbox);
@@ -183,7 +182,7 @@ impl Access {
     /// Connects to one of the servers.
     ///
     /// # Errors
-    /// If none answers, or takes the credential.
+    /// If no server answers, or none accepts the credential.
     pub async fn connect(&self) -> Result<Connection, ClusterError> {
         let connected = self.options.clone().connect(self.servers.as_slice()).await;
         let url = self.urls.clone();
@@ -209,7 +208,7 @@ impl Access {
     }
 }
 
-/// A connection, which is made anew whenever it breaks.
+/// A connection that reconnects whenever it breaks.
 #[derive(Debug, Clone)]
 pub struct Connection {
     pub(super) client: Client,
@@ -221,31 +220,31 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// Whether it is there at the moment.
+    /// True while the client is connected.
     pub(super) fn is_up(&self) -> bool {
         self.client.connection_state() == State::Connected
     }
 
-    /// The error of a connection that broke and can't be made anew, since the server refuses the credential.
+    /// The error of a connection that broke, if the server now refuses the credential.
     pub(super) fn refusal(&self) -> Option<ClusterError> {
         let is_refused = self.refusals.load(Ordering::Relaxed) >= REFUSALS;
         is_refused.then(|| ClusterError::Unauthorized { url: self.url.clone() })
     }
 
-    /// Says something to whoever listens, without a stream.
-    pub(super) async fn say(
+    /// Publishes a message to the current subscribers, outside the streams.
+    pub(super) async fn publish(
         &self,
         subject: String,
-        what: &impl Serialize,
+        message: &impl Serialize,
     ) -> Result<(), ClusterError> {
         let failed = ClusterError::nats("send");
-        let text = serde_json::to_vec(what).map_err(ClusterError::nats("write a message"))?;
+        let text = serde_json::to_vec(message).map_err(ClusterError::nats("write a message"))?;
         self.client.publish(subject, text.into()).await.map_err(failed)
     }
 }
 
 fn count_refusals(refusals: &AtomicU32, event: &Event) {
-    // The client passes the kind of the error on as text.
+    // The client reports the kind of the error as text.
     let refused = ConnectErrorKind::AuthorizationViolation.to_string();
     match event {
         Event::Connected => refusals.store(0, Ordering::Relaxed),
@@ -256,7 +255,7 @@ fn count_refusals(refusals: &AtomicU32, event: &Event) {
     }
 }
 
-fn tell(event: &Event) {
+fn log(event: &Event) {
     match event {
         Event::Connected => tracing::info!("connected to NATS"),
         Event::Disconnected => tracing::warn!("the connection to NATS is lost"),
@@ -270,19 +269,19 @@ mod tests {
     use super::Credential;
 
     #[test]
-    fn a_credential_file_names_all_that_a_worker_needs() {
+    fn a_credential_file_contains_all_settings_of_a_worker() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("worker.creds");
         let text = "# made by a test\nurl: tls://nats.example:4222\npool: gpu\ninbox: _INBOX.x\n\
                     -----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n\
                     -----BEGIN NATS USER JWT-----\neyJ0\n------END NATS USER JWT------\n";
         std::fs::write(&path, text).unwrap();
-        let found = Credential::read(&path).unwrap();
-        assert_eq!(found.url.as_deref(), Some("tls://nats.example:4222"));
-        assert_eq!(found.pool().unwrap().as_str(), "gpu");
-        assert_eq!(found.inbox.as_deref(), Some("_INBOX.x"));
+        let credential = Credential::read(&path).unwrap();
+        assert_eq!(credential.url.as_deref(), Some("tls://nats.example:4222"));
+        assert_eq!(credential.pool().unwrap().as_str(), "gpu");
+        assert_eq!(credential.inbox.as_deref(), Some("_INBOX.x"));
         let pem = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n";
-        assert_eq!(found.authority.as_deref(), Some(pem));
+        assert_eq!(credential.authority.as_deref(), Some(pem));
         std::fs::write(&path, "pool: A.B\n").unwrap();
         assert!(Credential::read(&path).unwrap_err().to_string().contains("A.B"));
     }

@@ -1,4 +1,4 @@
-//! What is said, as JSON.
+//! Messages between hub and workers, as JSON.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -11,15 +11,13 @@ use reconstruction::priors::Network;
 /// A tile to be computed.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TaskMessage {
-    /// The task.
     pub task: TaskId,
-    /// The attempt that it was published for.
+    /// The attempt that the message was published for.
     pub attempt: u32,
-    /// Its job, for logs.
+    /// The job, for logs.
     pub job: JobId,
-    /// Its planned processor time in seconds.
+    /// Planned processor time in seconds.
     pub cost: f64,
-    /// What is to be done.
     pub tile: TileTask,
     /// The windows of masks and snapshots, as prepared arrays.
     pub masks: Input,
@@ -29,7 +27,7 @@ pub struct TaskMessage {
 }
 
 impl TaskMessage {
-    /// All that the tile needs.
+    /// All files that the tile needs.
     pub fn inputs(&self) -> impl Iterator<Item = Input> {
         [Some(self.masks), Some(self.snapshots), self.model].into_iter().flatten()
     }
@@ -38,19 +36,19 @@ impl TaskMessage {
 /// A file that a tile needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Input {
-    /// The hash of its bytes.
+    /// Hash of the bytes.
     pub sha256: Sha256,
-    /// How many there are.
+    /// Number of bytes.
     pub bytes: u64,
 }
 
-/// How a tile ended.
+/// A worker's report on the end of an attempt.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Event {
     pub task: TaskId,
     pub attempt: u32,
     pub worker: WorkerId,
-    /// The message that the worker has, and its delivery, for a hub that did not hear the worker begin.
+    /// The message that the worker has, and its delivery. They serve a hub that was down when the worker began.
     #[serde(default)]
     pub seq: i64,
     #[serde(default)]
@@ -58,7 +56,7 @@ pub struct Event {
     pub end: End,
 }
 
-/// How a tile ended: by its frames, by an error, or because the worker was told to stop.
+/// The outcome of an attempt.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum End {
@@ -66,45 +64,45 @@ pub enum End {
         frames: Input,
         progress: TaskProgress,
         record: Value,
-        /// How the solver went, to its end.
+        /// The complete history of the solver.
         history: Option<String>,
     },
     Failed {
         reason: String,
         retry: bool,
     },
-    /// The worker was to end, or the job was cancelled.
+    /// The worker was stopped, or the job was cancelled.
     GivenBack,
-    /// Its process died, of itself (a fault, which the tile may have caused) or from outside.
+    /// The worker's process died. `fault` is true if the tile may be the cause, false if something killed it.
     Died {
         how: String,
         fault: bool,
     },
 }
 
-/// A worker that has a message asks whether to begin.
+/// Asks whether to begin with the tile of a message.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Begin {
     pub task: TaskId,
     /// The attempt that the message names.
     pub attempt: u32,
-    /// The message's place in its stream.
+    /// Sequence number of the message in its stream.
     pub seq: i64,
     pub delivery: u32,
     pub worker: WorkerId,
 }
 
-/// The answer.
+/// The answer to [`Begin`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BeginAnswer {
     /// Begin, as this attempt.
     Go(u32),
-    /// The message is of no use any more.
+    /// The tile needs no work. The message can be acknowledged.
     Over,
     /// Another worker has the message.
     Lost,
-    /// The tile is computed a second time, by another worker than the first time.
+    /// This worker has computed the tile already. Another worker must verify it.
     Another,
 }
 
@@ -112,42 +110,42 @@ pub enum BeginAnswer {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Beat {
     pub worker: WorkerId,
-    /// What it has in hand, and how far that is.
+    /// The worker's tile, with its progress.
     pub tile: Option<TileBeat>,
-    /// True for the last sign.
+    /// True if the worker leaves.
     pub leaves: bool,
 }
 
-/// How far a tile is.
+/// Progress of a tile.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileBeat {
     pub task: TaskId,
     pub attempt: u32,
     pub progress: TaskProgress,
-    /// How the solver went, if there is news.
+    /// The solver's history, if it has grown since the last beat.
     pub history: Option<String>,
 }
 
-/// An input is not to be had: it should be put again.
+/// Asks for an input that the worker can't fetch.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Want {
     pub task: TaskId,
     pub sha256: Sha256,
 }
 
-/// What the hub tells a worker.
+/// A notice of the hub to a worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Tell {
-    /// The attempt is not wanted any more.
+pub enum Notice {
+    /// The job was cancelled.
     Cancel { task: TaskId, attempt: u32 },
-    /// The attempt is over: another one has taken its place.
+    /// Another attempt has replaced this one.
     Lost { task: TaskId, attempt: u32 },
-    /// The server has started anew, and does not know the worker.
+    /// The server has restarted and does not know the worker.
     Introduce,
 }
 
-/// A worker introduces itself.
+/// Introduces a worker.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Hello {
     pub worker: WorkerId,
@@ -157,17 +155,17 @@ pub struct Hello {
     pub program: Program,
 }
 
-/// The answer.
+/// The answer to [`Hello`].
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum HelloAnswer {
-    /// Welcome; a message is delivered again after so many milliseconds without a sign.
+    /// The worker is accepted. A message is redelivered after `ack_wait_ms` milliseconds without a sign of work.
     Welcome { ack_wait_ms: u64 },
-    /// Why the worker is of no use here.
+    /// The reason why the worker is refused.
     Refused(String),
 }
 
-/// What computes: the results of two that are equal are the same on processors of a kind.
+/// Identifies a build. Equal builds compute equal results on processors of one kind.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Program {
     pub version: String,
@@ -176,13 +174,13 @@ pub struct Program {
 }
 
 impl Program {
-    /// This program, of the version that it says of itself, with its commit.
+    /// This program; `version` includes the commit.
     pub fn of(version: &str) -> Self {
         let models = Network::ALL.map(ModelRecord::carried).to_vec();
         Self { version: version.into(), models }
     }
 
-    /// Why a worker with `other` can't work for this one; none if it can.
+    /// The reason why a worker with the build `other` can't work for this one, if there is one.
     pub fn refusal(&self, other: &Self) -> Option<String> {
         if self.version != other.version {
             return Some(format!(
@@ -190,18 +188,18 @@ impl Program {
                 other.version, self.version
             ));
         }
-        let of = |program: &Self, name: &str| {
-            let found = program.models.iter().find(|model| model.name == name);
-            found.map_or("none", |model| &model.sha256).to_owned()
+        let hash = |program: &Self, name: &str| {
+            let model = program.models.iter().find(|model| model.name == name);
+            model.map_or("none", |model| &model.sha256).to_owned()
         };
         let names = self.models.iter().chain(&other.models).map(|model| &model.name);
-        let differs = names.into_iter().find(|name| of(self, name) != of(other, name))?;
+        let differs = names.into_iter().find(|name| hash(self, name) != hash(other, name))?;
         Some(format!(
             "both are version {}, but the worker's network {differs} has the hash {}, the \
              server's {}: install the same build",
             self.version,
-            of(other, differs),
-            of(self, differs)
+            hash(other, differs),
+            hash(self, differs)
         ))
     }
 }
@@ -211,7 +209,7 @@ mod tests {
     use super::Program;
 
     #[test]
-    fn another_version_or_another_network_is_refused_with_both() {
+    fn a_refusal_names_both_versions_or_both_networks() {
         let this = Program::of("0.1.0 (c51e2c3)");
         assert_eq!(this.refusal(&this), None);
         for version in ["0.0.9", "0.1.0 (e45ec33)", "0.1.0"] {

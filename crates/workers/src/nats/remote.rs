@@ -1,5 +1,4 @@
-//! The way to queue and files from a worker on another machine: the second implementation of
-//! [`Transport`].
+//! The transport of a worker on another machine, which computes tiles only.
 
 use std::io;
 use std::path::PathBuf;
@@ -22,7 +21,7 @@ use super::blobs::BlobError;
 use super::cache::Cache;
 use super::connection::{Access, ClusterError, Connection, Credential};
 use super::message::{
-    Beat, Begin, BeginAnswer, End, Event, Hello, HelloAnswer, Input, Program, TaskMessage, Tell,
+    Beat, Begin, BeginAnswer, End, Event, Hello, HelloAnswer, Input, Notice, Program, TaskMessage,
     TileBeat, Want,
 };
 use super::{arrays, names};
@@ -34,52 +33,54 @@ use engine::pipeline::tile::TileInput;
 use formats::FormatError;
 use store::{Heartbeat, Lease};
 
-/// How the process died that was killed from outside.
+/// The supervisor's description of a process that was killed from outside.
 const KILLED: &str = "killed";
-/// How long a request for a tile waits at the message server.
+/// Time that a request for a tile waits at the message server.
 const PULL: Duration = Duration::from_secs(5);
-/// How long the hub may take to say whether to begin; a server that is down does not stop its workers.
+/// Timeout of the question whether to begin. Workers go on while the server is down.
 const BEGIN: Duration = Duration::from_secs(1);
-/// Time between two signs of life of a worker that has nothing to do.
+/// Time between two signs of life of an idle worker.
 const SIGN: Duration = Duration::from_secs(5);
-/// Time between two looks for an input that is missing.
-const LOOK: Duration = Duration::from_millis(500);
-/// Milliseconds after which a tile is offered again that another worker is to compute. By chance, because
-/// two idle workers may get each other's refused tiles in turn for ever.
-const ANOTHER: std::ops::Range<u64> = 200..2000;
-/// How long the end of a tile is tried to be told, and how long once the worker is to end.
-const TELL: (Duration, Duration) = (Duration::from_secs(600), Duration::from_secs(3));
+/// Pause before a failed request or fetch is repeated.
+const RETRY_PAUSE: Duration = Duration::from_millis(500);
+/// Milliseconds until a tile that another worker must compute is offered again. The pause is random. Otherwise two
+/// idle workers could exchange each other's refused tiles forever.
+const REFUSAL_PAUSE: std::ops::Range<u64> = 200..2000;
+/// Time for which the worker tries to report the end of a tile.
+const REPORT_TIME: Duration = Duration::from_secs(600);
+/// Time for which a worker that was asked to stop tries to report the end of a tile.
+const STOP_REPORT_TIME: Duration = Duration::from_secs(3);
 
-/// What a worker on another machine is told when it starts.
+/// Settings of a worker on another machine.
 #[derive(Debug, Clone)]
 pub struct RemoteSettings {
-    /// What this worker is.
+    /// The build of this worker.
     pub program: Program,
-    /// Addresses of the message server, separated by commas; none for those of the credential.
+    /// Addresses of the message server, separated by commas. The default is those in the credential.
     pub urls: Option<String>,
-    /// The file with the credential; none for a server that is open to all.
+    /// The file with the credential. A server that is open to all needs none.
     pub credential: Option<PathBuf>,
-    /// The pool; none for that of the credential.
+    /// The pool. The default is that of the credential.
     pub pool: Option<Pool>,
-    /// The folder of the cache, and the most bytes in it.
+    /// The folder of the cache, and its limit in bytes.
     pub cache: (PathBuf, u64),
-    /// Where it computes, for the list of workers.
+    /// The device that computes, for the list of workers.
     pub device: String,
-    /// How long to look for an input that is missing.
+    /// Time to wait for a missing input.
     pub patience: Duration,
-    /// How long to go on without a tile; none for ever.
+    /// Time without a tile after which the worker ends. The default is never.
     pub idle: Option<Duration>,
-    /// The file for what is in hand, for the process after this one.
+    /// The file that names the current tile, for the next process of this worker.
     pub hand: Option<PathBuf>,
-    /// How the process before this one died.
+    /// Cause of death of the previous process of this worker.
     pub died: Option<String>,
 }
 
-/// What is in hand, for the process after this one.
+/// The current tile, as the next process reports it if this one dies.
 #[derive(Debug, Serialize, Deserialize)]
 struct Hand {
     event: Event,
-    /// Where the message is let go.
+    /// Subject that acknowledges the tile's message.
     acknowledge: String,
 }
 
@@ -100,25 +101,25 @@ struct Inner {
     hand: Option<PathBuf>,
     stop: CancellationToken,
     runtime: Handle,
-    /// The tile in hand, and since when there is one or none.
+    /// The current tile, and the time of the last change from or to a tile.
     held: Mutex<(Option<Arc<Held>>, Instant)>,
 }
 
-/// A tile in hand.
+/// The tile that this worker computes.
 #[derive(Debug)]
 struct Held {
     task: TaskMessage,
-    /// The attempt as which the hub knows it.
+    /// The attempt number that the hub assigned.
     attempt: u32,
     begin: Begin,
     message: Message,
-    /// What the hub has told of it.
-    told: watch::Sender<Heartbeat>,
-    /// How the solver went so far.
+    /// The hub's last notice about the tile.
+    notice: watch::Sender<Heartbeat>,
+    /// The solver's history so far.
     history: Mutex<Option<String>>,
-    /// The last answer to a sign that the tile is worked on.
-    answered: Mutex<Instant>,
-    /// Gives these signs.
+    /// Time of the last sign of work that the message server confirmed.
+    confirmed: Mutex<Instant>,
+    /// The task that sends signs of work.
     keeper: Mutex<Option<AbortHandle>>,
 }
 
@@ -130,21 +131,21 @@ impl Drop for Held {
     }
 }
 
-/// Whose a tile is.
+/// The worker's right to its tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Standing {
-    Mine,
-    /// This worker was silent for long, and nobody says.
-    Unsure,
-    Anothers,
+enum Ownership {
+    Held,
+    /// This worker was silent for long, and the hub does not answer.
+    Unknown,
+    Lost,
 }
 
 impl Remote {
-    /// Connects and introduces the worker; waits for a server that is not there yet.
+    /// Connects and introduces the worker. Waits for a server that has not started yet. Returns `None` if `stop` was
+    /// cancelled, or the idle time is over, before the server answered.
     ///
     /// # Errors
-    /// Settings that can't be, a message server that does not answer, a server that refuses the worker.
-    /// None if `stop` was called, or the time without a tile is over, before the server answered.
+    /// If the settings are invalid, the message server does not answer, or the server refuses the worker.
     pub async fn open(
         settings: RemoteSettings,
         worker: WorkerId,
@@ -157,19 +158,19 @@ impl Remote {
         let pool =
             settings.pool.or(credential.pool().cloned()).ok_or(ClusterError::Credential {
                 path: "file".into(),
-                reason: "it names no pool: name one with --pool".into(),
+                reason: "it names no pool: state one with --pool".into(),
             })?;
         let cache = Cache::open(&settings.cache.0, settings.cache.1)?;
         let host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         let name = format!("sci-recon worker {host}");
         let connection =
             Access::new(settings.urls.as_deref(), &credential, &name)?.connect().await?;
-        let told = connection.client.subscribe(names::tell(&pool, worker)).await;
-        let told = told.map_err(ClusterError::nats("listen to the server"))?;
+        let notices = connection.client.subscribe(names::notice(&pool, worker)).await;
+        let notices = notices.map_err(ClusterError::nats("listen to the server"))?;
         let device = settings.device;
         let hello =
             Hello { worker, host, pid: std::process::id(), device, program: settings.program };
-        let (start, mut pause) = (Instant::now(), LOOK);
+        let (start, mut pause) = (Instant::now(), RETRY_PAUSE);
         let ack_wait = loop {
             if let Some(ack_wait) = introduce(&connection, &pool, &hello).await? {
                 break ack_wait;
@@ -203,38 +204,39 @@ impl Remote {
         };
         let remote = Self(Arc::new(inner));
         if let Some(how) = settings.died {
-            remote.tell_of_death(how).await;
+            remote.report_death(how).await;
         }
-        tokio::spawn(remote.clone().listen(told));
-        tokio::spawn(remote.clone().give_signs());
+        tokio::spawn(remote.clone().listen(notices));
+        tokio::spawn(remote.clone().send_signs());
         Ok(Some(remote))
     }
 
-    /// Says goodbye.
+    /// Reports that the worker leaves.
     pub async fn leave(&self) {
         let beat = Beat { worker: self.0.hello.worker, tile: None, leaves: true };
-        let said = async {
-            self.say("beat", &beat).await?;
+        let sent = async {
+            self.send("beat", &beat).await?;
             let flushed = self.0.connection.client.flush().await;
-            flushed.map_err(ClusterError::nats("say goodbye"))
+            flushed.map_err(ClusterError::nats("report that the worker leaves"))
         };
-        // Without a connection it is not sent, and waits for one.
-        if !tokio::time::timeout(BEGIN, said).await.is_ok_and(|said| said.is_ok()) {
-            tracing::debug!("the goodbye was not heard: the worker is forgotten after a while");
+        // Without a connection, sending waits until there is one.
+        if !tokio::time::timeout(BEGIN, sent).await.is_ok_and(|sent| sent.is_ok()) {
+            tracing::debug!("the farewell was not sent: the server drops the worker after a while");
         }
     }
 
-    async fn say(&self, what: &str, message: &impl serde::Serialize) -> Result<(), ClusterError> {
-        self.0.connection.say(names::ask(what, &self.0.pool), message).await
+    /// Sends a message of this kind to the hub, outside the streams.
+    async fn send(&self, kind: &str, message: &impl serde::Serialize) -> Result<(), ClusterError> {
+        self.0.connection.publish(names::ask(kind, &self.0.pool), message).await
     }
 
-    /// Hears what the hub tells.
-    async fn listen(self, mut told: Subscriber) {
-        while let Some(message) = told.next().await {
+    /// Handles the hub's notices.
+    async fn listen(self, mut notices: Subscriber) {
+        while let Some(message) = notices.next().await {
             let (about, answer) = match serde_json::from_slice(&message.payload) {
-                Ok(Tell::Cancel { task, attempt }) => ((task, attempt), Heartbeat::Cancelled),
-                Ok(Tell::Lost { task, attempt }) => ((task, attempt), Heartbeat::Lost),
-                Ok(Tell::Introduce) => {
+                Ok(Notice::Cancel { task, attempt }) => ((task, attempt), Heartbeat::Cancelled),
+                Ok(Notice::Lost { task, attempt }) => ((task, attempt), Heartbeat::Lost),
+                Ok(Notice::Introduce) => {
                     let Inner { connection, pool, hello, stop, .. } = &*self.0;
                     if let Err(error) = introduce(connection, pool, hello).await {
                         tracing::error!(%error, "the worker ends");
@@ -243,33 +245,33 @@ impl Remote {
                     continue;
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "the server says what this worker can't read");
+                    tracing::warn!(%error, "a notice of the server can't be read");
                     continue;
                 }
             };
             if let Some(held) = self.held()
                 && about == (held.task.task, held.attempt)
             {
-                held.told.send_replace(answer);
+                held.notice.send_replace(answer);
             }
         }
     }
 
-    /// Why the worker has ended, if the message server refuses its credential.
+    /// The reason why the worker has ended, if the message server refuses its credential.
     #[must_use]
     pub fn refusal(&self) -> Option<ClusterError> {
         self.0.connection.refusal()
     }
 
-    async fn give_signs(self) {
+    async fn send_signs(self) {
         while !self.0.stop.is_cancelled() {
             if self.refusal().is_some() {
                 return self.0.stop.cancel();
             }
             if self.held().is_none() {
                 let beat = Beat { worker: self.0.hello.worker, tile: None, leaves: false };
-                if let Err(error) = self.say("beat", &beat).await {
-                    tracing::warn!(%error, "no sign of life could be given");
+                if let Err(error) = self.send("beat", &beat).await {
+                    tracing::warn!(%error, "a sign of life could not be sent");
                 }
             }
             tokio::time::sleep(SIGN).await;
@@ -280,25 +282,27 @@ impl Remote {
         lock(&self.0.held).0.clone()
     }
 
-    /// Tells how the process before this one died, with what it had in hand.
-    async fn tell_of_death(&self, how: String) {
+    /// Reports that the previous process died with a tile, and the cause.
+    async fn report_death(&self, cause: String) {
         let Some(path) = &self.0.hand else { return };
-        let found = std::fs::read(path).ok();
-        let hand: Option<Hand> = found.and_then(|text| serde_json::from_slice(&text).ok());
+        let text = std::fs::read(path).ok();
+        let hand: Option<Hand> = text.and_then(|text| serde_json::from_slice(&text).ok());
         let Some(Hand { mut event, acknowledge }) = hand else { return };
-        if let End::Died { how: told, fault } = &mut event.end {
-            *fault = how != KILLED;
-            *told = how;
+        if let End::Died { how, fault } = &mut event.end {
+            *fault = cause != KILLED;
+            *how = cause;
         }
-        let told = self.publish(&event).await;
+        let reported = self.publish(&event).await;
         let acked = self.0.connection.client.publish(acknowledge, "+ACK".into()).await;
-        if told.is_err() || acked.is_err() {
-            tracing::warn!("it could not be told: the tile is delivered again after a while");
+        if reported.is_err() || acked.is_err() {
+            tracing::warn!(
+                "the death of the previous process is not reported: its tile is delivered again after a while"
+            );
         }
         self.note_hand(None);
     }
 
-    /// Notes what is in hand, a tile that begins and its message, for the process after this one.
+    /// Records the current tile and its message in a file, for the next process.
     fn note_hand(&self, held: Option<(&Begin, &Message)>) {
         let Some(path) = &self.0.hand else { return };
         let noted = match held {
@@ -315,31 +319,31 @@ impl Remote {
             }
         };
         if let Err(error) = noted {
-            tracing::warn!(%error, "what is in hand can't be noted");
+            tracing::warn!(%error, "the current tile can't be recorded");
         }
     }
 
     fn hold(&self, held: Option<Arc<Held>>) {
         let begin = held.as_ref().map(|held| Begin { attempt: held.attempt, ..held.begin });
         self.note_hand(begin.as_ref().zip(held.as_ref().map(|held| &held.message)));
-        let mut place = lock(&self.0.held);
-        if place.0.is_some() || held.is_some() {
-            *place = (held, Instant::now());
+        let mut current = lock(&self.0.held);
+        if current.0.is_some() || held.is_some() {
+            *current = (held, Instant::now());
         }
     }
 
-    /// The next message, if one comes soon.
+    /// Pulls the next message. Returns `None` if none arrives within [`PULL`].
     async fn pull(&self) -> Result<Option<Message>, TransportError> {
         let batch = self.0.consumer.batch().max_messages(1).expires(PULL).messages();
         let next = async { batch.await?.next().await.transpose() };
-        // A pull may be forgotten when the stream's leader changes.
+        // The server may forget a pull when the stream's leader changes.
         match tokio::time::timeout(PULL + BEGIN, next).await {
-            Ok(found) => found,
+            Ok(message) => message,
             Err(_) => Ok(None),
         }
     }
 
-    /// Asks the hub whether to begin; none if it does not answer.
+    /// Asks the hub whether to begin. Returns `None` if it does not answer.
     async fn ask(&self, begin: &Begin) -> Option<BeginAnswer> {
         let text = serde_json::to_vec(begin).ok()?;
         let asked =
@@ -348,7 +352,7 @@ impl Remote {
         serde_json::from_slice(&answer.payload).ok()
     }
 
-    /// Begins with a message, unless it is of no use.
+    /// Begins with the tile of a message, unless the hub declines.
     async fn begin(&self, message: Message) -> Result<Option<Claim>, TransportError> {
         let (seq, delivery) = {
             let info = message.info()?;
@@ -357,14 +361,14 @@ impl Remote {
         let task: TaskMessage = match serde_json::from_slice(&message.payload) {
             Ok(task) => task,
             Err(error) => {
-                // The hub finds that it is gone.
+                // The hub's sweep then finds the message missing.
                 message.ack_with(AckKind::Term).await?;
                 return Err(format!("a tile's message can't be read: {error}").into());
             }
         };
         let worker = self.0.hello.worker;
         let begin = Begin { task: task.task, attempt: task.attempt, seq, delivery, worker };
-        // Before the hub counts on this process: nobody else would know that it died with the message.
+        // Recorded before the hub relies on this process. Otherwise its death would not be noticed.
         self.note_hand(Some((&begin, &message)));
         let attempt = match self.ask(&begin).await {
             Some(BeginAnswer::Go(attempt)) => attempt,
@@ -374,7 +378,7 @@ impl Remote {
             }
             Some(BeginAnswer::Another) => {
                 self.note_hand(None);
-                let pause = Duration::from_millis(rand::random_range(ANOTHER));
+                let pause = Duration::from_millis(rand::random_range(REFUSAL_PAUSE));
                 message.ack_with(AckKind::Nak(Some(pause))).await?;
                 return Ok(None);
             }
@@ -384,7 +388,7 @@ impl Remote {
                 return Ok(None);
             }
             None => {
-                tracing::warn!("the server does not answer: the worker goes on without it");
+                tracing::warn!("the server does not answer: the worker continues without it");
                 task.attempt
             }
         };
@@ -401,21 +405,21 @@ impl Remote {
             attempt,
             begin,
             message,
-            told: watch::Sender::new(Heartbeat::Continue),
+            notice: watch::Sender::new(Heartbeat::Continue),
             history: Mutex::default(),
-            answered: Mutex::new(Instant::now()),
+            confirmed: Mutex::new(Instant::now()),
             keeper: Mutex::new(None),
         });
-        let kept = Arc::downgrade(&held);
+        let weak = Arc::downgrade(&held);
         let pause = self.0.ack_wait / 6;
         let keeper = tokio::spawn(async move {
             loop {
                 tokio::time::sleep(pause).await;
-                let Some(held) = kept.upgrade() else { return };
-                let asked = Instant::now();
+                let Some(held) = weak.upgrade() else { return };
+                let sent = Instant::now();
                 match held.message.double_ack_with(AckKind::Progress).await {
-                    Ok(()) => *lock(&held.answered) = asked,
-                    Err(error) => tracing::warn!(%error, "a sign of work is not answered"),
+                    Ok(()) => *lock(&held.confirmed) = sent,
+                    Err(error) => tracing::warn!(%error, "a sign of work is not confirmed"),
                 }
             }
         });
@@ -424,32 +428,32 @@ impl Remote {
         Ok(Some(claim))
     }
 
-    /// The tile in hand, if the lease is for it.
+    /// The current tile, if the lease is for it.
     fn held_for(&self, lease: &Lease) -> Result<Arc<Held>, TransportError> {
         let held = self
             .held()
             .filter(|held| (held.task.task, held.attempt) == (lease.task, lease.attempt));
-        held.ok_or_else(|| "the tile is not in hand any more".into())
+        held.ok_or_else(|| "this worker no longer holds the tile".into())
     }
 
-    /// Whose a tile is: that of a worker which was suspended for long may be another's, and the message
-    /// with it.
-    async fn standing(&self, held: &Held) -> Standing {
-        if lock(&held.answered).elapsed() < self.0.ack_wait {
-            return Standing::Mine;
+    /// Determines whether the worker still owns its tile. After a long suspension, the message may have been delivered
+    /// to another worker.
+    async fn ownership(&self, held: &Held) -> Ownership {
+        if lock(&held.confirmed).elapsed() < self.0.ack_wait {
+            return Ownership::Held;
         }
         match self.ask(&held.begin).await {
-            Some(BeginAnswer::Go(_) | BeginAnswer::Over) => Standing::Mine,
-            Some(BeginAnswer::Lost | BeginAnswer::Another) => Standing::Anothers,
-            None => Standing::Unsure,
+            Some(BeginAnswer::Go(_) | BeginAnswer::Over) => Ownership::Held,
+            Some(BeginAnswer::Lost | BeginAnswer::Another) => Ownership::Lost,
+            None => Ownership::Unknown,
         }
     }
 
-    /// Tells how a tile ended, and lets its message go.
+    /// Reports the end of a tile, and acknowledges its message.
     async fn end(&self, lease: &Lease, end: End) -> Result<Heartbeat, TransportError> {
         let held = self.held_for(lease)?;
-        let standing = self.standing(&held).await;
-        if standing == Standing::Anothers {
+        let ownership = self.ownership(&held).await;
+        if ownership == Ownership::Lost {
             self.hold(None);
             return Ok(Heartbeat::Lost);
         }
@@ -457,21 +461,21 @@ impl Remote {
         let Lease { task, attempt, worker, .. } = *lease;
         let event = Event { task, attempt, worker, seq, delivery, end };
         self.publish(&event).await?;
-        if standing == Standing::Mine {
-            let let_go = self.persist(|| async {
+        if ownership == Ownership::Held {
+            let acknowledged = self.persist(|| async {
                 let acked = held.message.double_ack().await;
-                acked.map_err(ClusterError::nats("let the message go"))
+                acked.map_err(ClusterError::nats("acknowledge the message"))
             });
-            if let Err(error) = let_go.await {
-                // It is delivered again, and the hub says that the tile is done.
-                tracing::warn!(%error, "the tile's message stays");
+            if let Err(error) = acknowledged.await {
+                // The message is delivered again, and the hub answers that the tile is done.
+                tracing::warn!(%error, "the tile's message is not acknowledged");
             }
         }
         self.hold(None);
         Ok(Heartbeat::Continue)
     }
 
-    /// Publishes how a tile ended, and waits until that is stored.
+    /// Publishes an event, and waits until it is stored.
     async fn publish(&self, event: &Event) -> Result<(), TransportError> {
         let text = serde_json::to_vec(event)?;
         let id = format!("{}.{}.{}", event.task, event.attempt, event.worker);
@@ -482,51 +486,52 @@ impl Remote {
             let headers = message.headers.unwrap_or_default();
             let sent =
                 context.publish_with_headers(message.subject, headers, message.payload).await;
-            sent.map_err(ClusterError::nats("tell the end"))?
+            sent.map_err(ClusterError::nats("report the end of a tile"))?
                 .await
-                .map_err(ClusterError::nats("tell the end"))
+                .map_err(ClusterError::nats("report the end of a tile"))
         })
         .await?;
         Ok(())
     }
 
-    /// Does something again and again until it succeeds or the time is over.
-    async fn persist<T, F>(&self, mut what: impl FnMut() -> F) -> Result<T, ClusterError>
+    /// Repeats an action until it succeeds or the time is over.
+    async fn persist<T, F>(&self, mut action: impl FnMut() -> F) -> Result<T, ClusterError>
     where
         F: Future<Output = Result<T, ClusterError>>,
     {
         let start = Instant::now();
         let mut stopped: Option<Instant> = None;
         loop {
-            let error = match what().await {
+            let error = match action().await {
                 Ok(done) => return Ok(done),
                 Err(error) => error,
             };
             if stopped.is_none() && self.0.stop.is_cancelled() {
                 stopped = Some(Instant::now());
             }
-            if start.elapsed() > TELL.0 || stopped.is_some_and(|since| since.elapsed() > TELL.1) {
+            let stop_time_over = stopped.is_some_and(|since| since.elapsed() > STOP_REPORT_TIME);
+            if start.elapsed() > REPORT_TIME || stop_time_over {
                 return Err(error);
             }
-            tracing::warn!(%error, "it is tried again");
-            tokio::time::sleep(LOOK).await;
+            tracing::warn!(%error, "the worker tries again");
+            tokio::time::sleep(RETRY_PAUSE).await;
         }
     }
 
-    /// Brings all that a tile needs into the cache.
+    /// Fetches the inputs of a tile into the cache.
     async fn fetch(&self, held: &Held) -> Result<(), PipelineError> {
         let needed: Vec<Sha256> = held.task.inputs().map(|input| input.sha256).collect();
         for input in held.task.inputs() {
             if !lock(&self.0.cache).has(input.sha256) {
                 let bytes = self.get(held, input).await?;
                 let added = lock(&self.0.cache).add(input.sha256, &bytes, &needed);
-                added.map_err(unread)?;
+                added.map_err(fetch_error)?;
             }
         }
         Ok(())
     }
 
-    /// Gets an input; asks for it if it is missing or damaged.
+    /// Gets an input. Asks the hub to send it again if it is missing or damaged.
     async fn get(&self, held: &Held, input: Input) -> Result<Vec<u8>, PipelineError> {
         let (start, mut missing) = (Instant::now(), 0);
         loop {
@@ -535,28 +540,28 @@ impl Remote {
                 Ok(bytes) => return Ok(bytes),
                 Err(error) => error,
             };
-            if *held.told.borrow() != Heartbeat::Continue || self.0.stop.is_cancelled() {
+            if *held.notice.borrow() != Heartbeat::Continue || self.0.stop.is_cancelled() {
                 return Err(PipelineError::Stopped);
             }
             if start.elapsed() > self.0.patience {
-                let text = format!("input {} can't be had: {error}", input.sha256);
-                return Err(unread(io::Error::other(text)));
+                let text = format!("input {} is missing: {error}", input.sha256);
+                return Err(fetch_error(io::Error::other(text)));
             }
             missing += u32::from(!matches!(error, BlobError::Failed(_)));
-            // A replica may only be late, once.
+            // The first failure may be due to a replica that lags.
             if missing % 4 == 2 {
-                tracing::warn!(%error, sha256 = %input.sha256, "an input is asked for");
+                tracing::warn!(%error, sha256 = %input.sha256, "an input is requested again");
                 let want = Want { task: held.task.task, sha256: input.sha256 };
-                if let Err(error) = self.say("want", &want).await {
-                    tracing::warn!(%error, "an input can't be asked for");
+                if let Err(error) = self.send("want", &want).await {
+                    tracing::warn!(%error, "an input can't be requested");
                 }
             }
-            tokio::time::sleep(LOOK).await;
+            tokio::time::sleep(RETRY_PAUSE).await;
         }
     }
 }
 
-/// Says hello; none if no server answers.
+/// Introduces the worker. Returns the time until redelivery, or `None` if no server answers.
 async fn introduce(
     connection: &Connection,
     pool: &Pool,
@@ -578,7 +583,7 @@ async fn introduce(
     match serde_json::from_slice(&answer) {
         Ok(HelloAnswer::Welcome { ack_wait_ms }) => Ok(Some(Duration::from_millis(ack_wait_ms))),
         Ok(HelloAnswer::Refused(reason)) => Err(ClusterError::Refused(reason)),
-        Err(error) => Err(ClusterError::Refused(format!("it answers what can't be read: {error}"))),
+        Err(error) => Err(ClusterError::Refused(format!("its answer can't be read: {error}"))),
     }
 }
 
@@ -587,7 +592,7 @@ impl Transport for Remote {
         Ok(())
     }
 
-    async fn seen(&self) -> Result<(), TransportError> {
+    async fn report_alive(&self) -> Result<(), TransportError> {
         Ok(())
     }
 
@@ -620,21 +625,21 @@ impl Transport for Remote {
         history: Option<&str>,
     ) -> Result<Heartbeat, TransportError> {
         let held = self.held_for(lease)?;
-        let told = *held.told.borrow();
+        let notice = *held.notice.borrow();
         if history.is_some() {
             *lock(&held.history) = history.map(str::to_owned);
         }
         let Lease { task, attempt, worker, .. } = *lease;
         let tile = TileBeat { task, attempt, progress, history: history.map(str::to_owned) };
-        self.say("beat", &Beat { worker, tile: Some(tile), leaves: false }).await?;
-        Ok(told)
+        self.send("beat", &Beat { worker, tile: Some(tile), leaves: false }).await?;
+        Ok(notice)
     }
 
     async fn called_off(&self, lease: &Lease) -> Heartbeat {
         let Ok(held) = self.held_for(lease) else { return std::future::pending().await };
-        let mut told = held.told.subscribe();
-        match told.wait_for(|told| *told != Heartbeat::Continue).await {
-            Ok(told) => *told,
+        let mut notices = held.notice.subscribe();
+        match notices.wait_for(|notice| *notice != Heartbeat::Continue).await {
+            Ok(notice) => *notice,
             Err(_) => std::future::pending().await,
         }
     }
@@ -642,10 +647,10 @@ impl Transport for Remote {
     async fn complete(&self, lease: &Lease, done: Done) -> Result<Heartbeat, TransportError> {
         let Done { progress, record, output } = done;
         let Output::Stack(frames) = output else {
-            return Err("a tile has made something else than frames".into());
+            return Err("a tile's output must be frames".into());
         };
-        let made = tokio::task::spawn_blocking(move || file_of(&frames)).await?;
-        let (frames, bytes) = made?;
+        let serialized = tokio::task::spawn_blocking(move || serialize(&frames)).await?;
+        let (frames, bytes) = serialized?;
         let bytes = bytes::Bytes::from(bytes);
         let Lease { task, attempt, worker, .. } = *lease;
         let prefix = names::output(&self.0.pool, task, attempt, worker);
@@ -668,17 +673,19 @@ impl Transport for Remote {
     }
 
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError> {
-        let gone = || unread(io::Error::other("the tile is not in hand any more"));
-        let held = self.held().ok_or_else(gone)?;
+        let lost = || fetch_error(io::Error::other("this worker no longer holds the tile"));
+        let held = self.held().ok_or_else(lost)?;
         self.0.runtime.block_on(self.fetch(&held))?;
         let path = |input: Input| lock(&self.0.cache).path(input.sha256);
         let masks = arrays::read(&path(held.task.masks))?;
         let y = arrays::read(&path(held.task.snapshots))?;
-        let place = (task.tile.height, task.tile.width);
-        let of = |array: &Array3<f32>| (array.dim().1, array.dim().2);
-        if of(&masks) != place || of(&y) != place {
-            let problem =
-                format!("masks {:?} and snapshots {:?} of a tile {place:?}", of(&masks), of(&y));
+        let expected = (task.tile.height, task.tile.width);
+        let size = |array: &Array3<f32>| (array.dim().1, array.dim().2);
+        if size(&masks) != expected || size(&y) != expected {
+            let (masks, y) = (size(&masks), size(&y));
+            let problem = format!(
+                "masks {masks:?} and snapshots {y:?} do not fit the tile's size {expected:?}"
+            );
             return Err(PipelineError::Record { what: "tile's message", problem });
         }
         let pieces = task.pieces.clone();
@@ -690,17 +697,17 @@ impl Transport for Remote {
     }
 }
 
-/// Frames as a file, and its name.
-fn file_of(frames: &Array3<f32>) -> Result<(Input, Vec<u8>), FormatError> {
+/// Serializes frames, and computes hash and size.
+fn serialize(frames: &Array3<f32>) -> Result<(Input, Vec<u8>), FormatError> {
     let bytes = arrays::to_bytes(frames.view())?;
     Ok((Input { sha256: Sha256::of(&bytes), bytes: bytes.len() as u64 }, bytes))
 }
 
-fn unread(source: io::Error) -> PipelineError {
+fn fetch_error(source: io::Error) -> PipelineError {
     PipelineError::Format(FormatError::Io { action: "fetch what the tile needs", source })
 }
 
-fn lock<T>(place: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Whole values are stored: a poisoned lock holds a good one.
-    place.lock().unwrap_or_else(PoisonError::into_inner)
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every change is a single assignment, so the value is valid even if a thread panicked.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

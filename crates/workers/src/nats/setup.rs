@@ -1,4 +1,4 @@
-//! The streams and their consumers.
+//! Creates the streams and their consumers.
 
 use std::time::Duration;
 
@@ -14,11 +14,11 @@ use super::connection::{ClusterError, Connection};
 use super::names;
 use engine::job::Pool;
 
-/// Copies of each message, where the message server is a cluster.
+/// Copies of each message if the message server is a cluster.
 const REPLICAS: usize = 3;
-/// Messages that may be out for a consumer, and requests for them.
+/// Limit of a consumer's unacknowledged messages, and of the requests that wait for messages.
 const AT_ONCE: i64 = 16_384;
-/// An event that was not dealt with is delivered to the hub again after so long.
+/// Time after which an event that was not acknowledged is delivered to the hub again.
 pub(super) const EVENT_WAIT: Duration = Duration::from_secs(30);
 const HOUR: Duration = Duration::from_secs(3600);
 
@@ -53,7 +53,7 @@ fn streams() -> [Config; 4] {
 }
 
 impl Connection {
-    /// Makes the streams that are missing; says when that of tiles was made.
+    /// Creates missing streams. Returns the creation time of the stream of tiles, which identifies it.
     ///
     /// # Errors
     /// If the server refuses, or has no quorum.
@@ -70,9 +70,9 @@ impl Connection {
 
     async fn make_stream(&self, config: Config) -> Result<(), ClusterError> {
         let copies = Config { num_replicas: REPLICAS, ..config.clone() };
-        let made = match self.context.create_stream(copies).await {
+        let created = match self.context.create_stream(copies).await {
             Err(error) => match error.kind() {
-                // One server alone keeps one copy. That a part of a cluster is down is an error.
+                // A single server keeps one copy. A cluster without enough nodes is an error.
                 CreateStreamErrorKind::JetStream(error)
                     if error.error_code() == ErrorCode::STREAM_REPLICAS_NOT_SUPPORTED =>
                 {
@@ -80,12 +80,12 @@ impl Connection {
                 }
                 _ => Err(error),
             },
-            made => made,
+            created => created,
         };
-        made.map(|_| ()).map_err(ClusterError::nats("make a stream"))
+        created.map(|_| ()).map_err(ClusterError::nats("create a stream"))
     }
 
-    /// Makes the consumer of a pool, of which each worker pulls.
+    /// Creates the consumer from which all workers of a pool pull.
     ///
     /// # Errors
     /// If the server refuses, or has no quorum.
@@ -103,33 +103,32 @@ impl Connection {
             max_waiting: AT_ONCE,
             ..Consumer::default()
         };
-        let made = self.context.create_consumer_on_stream(config, names::TASKS).await;
-        made.map(|_| ()).map_err(ClusterError::nats("make the consumer of a pool"))
+        let created = self.context.create_consumer_on_stream(config, names::TASKS).await;
+        created.map(|_| ()).map_err(ClusterError::nats("create the consumer of a pool"))
     }
 
-    /// The consumer of a pool.
+    /// Finds the consumer of a pool.
     ///
     /// # Errors
-    /// If there is none, or the credential has no right to it.
+    /// If it does not exist, or the credential has no right to it.
     pub(super) async fn pool(&self, pool: &Pool) -> Result<PullConsumer, ClusterError> {
-        let found = self.context.get_consumer_from_stream(pool.as_str(), names::TASKS).await;
-        found.map_err(ClusterError::nats("find the consumer of the pool"))
+        let consumer = self.context.get_consumer_from_stream(pool.as_str(), names::TASKS).await;
+        consumer.map_err(ClusterError::nats("find the consumer of the pool"))
     }
 
-    /// Removes a consumer, which is made anew by the next sweep at the latest; who pulls of it sees none for
-    /// that long.
+    /// Removes a consumer. The next sweep creates it again at the latest; until then, pulls from it fail.
     pub(super) async fn drop_consumer(&self, stream: &str, consumer: &str) {
         if let Err(error) = self.context.delete_consumer_from_stream(consumer, stream).await {
             tracing::warn!(%error, stream, consumer, "a consumer can't be removed");
         }
     }
 
-    /// The pools with events that wait.
+    /// Lists the pools with waiting events.
     ///
     /// # Errors
     /// If the server refuses, or has no quorum.
     pub(super) async fn pools_with_events(&self) -> Result<Vec<Pool>, ClusterError> {
-        let failed = || ClusterError::nats("look at the subjects of events");
+        let failed = || ClusterError::nats("read the subjects of events");
         let stream = self.context.get_stream_no_info(names::EVENTS).await;
         let stream = stream.map_err(ClusterError::nats("find the stream of events"))?;
         let subjects = stream.info_with_subjects("sci.v1.event.*").await.map_err(failed())?;
@@ -137,7 +136,7 @@ impl Connection {
         Ok(subjects.iter().filter_map(|(subject, _)| names::pool_of(subject)).collect())
     }
 
-    /// The consumer of a pool's events, which is made if it is missing.
+    /// The consumer of a pool's events. Creates it if it is missing.
     ///
     /// # Errors
     /// If the server refuses, or has no quorum.
@@ -150,7 +149,7 @@ impl Connection {
             max_ack_pending: AT_ONCE,
             ..Consumer::default()
         };
-        let made = self.context.create_consumer_on_stream(config, names::EVENTS).await;
-        made.map_err(ClusterError::nats("make the consumer of a pool's events"))
+        let created = self.context.create_consumer_on_stream(config, names::EVENTS).await;
+        created.map_err(ClusterError::nats("create the consumer of a pool's events"))
     }
 }

@@ -1,5 +1,5 @@
-//! Checks a tile that a worker reports as done, before the store takes it. The worker is not trusted: shape,
-//! values and record must be possible for the tile, and the server computes the residual itself.
+//! Checks a tile that a worker reports as done, before the store accepts it. The worker is not trusted: shape,
+//! values and record must be possible for the tile, and the server recomputes the residual.
 
 use std::time::Duration;
 
@@ -28,15 +28,15 @@ use store::{Completion, RemoteTask, StagedBlob, Work};
 
 /// Largest relative difference between the residual that a worker states and the one that the server computes.
 /// Both sum in f64 in one order ([`engine::pipeline::residual`]), so an honest worker states the same bits.
-const RESIDUAL: f32 = 0.01;
-/// More hardware threads than a machine has.
-const THREADS: f64 = 1024.0;
+const RESIDUAL_TOLERANCE: f32 = 0.01;
+/// Number of hardware threads that no machine exceeds.
+const MAX_THREADS: f64 = 1024.0;
 /// Seconds by which the clock may have been set back since the attempt began.
-const CLOCK: f64 = 60.0;
-/// Most memory in bytes that a process can have: 64 TiB, which is what x86-64 addresses.
-const MEMORY: u64 = 1 << 46;
+const CLOCK_TOLERANCE: f64 = 60.0;
+/// Limit of a process's memory in bytes: 64 TiB, the address space of x86-64.
+const MAX_MEMORY: u64 = 1 << 46;
 /// Longest name of an execution provider or of a version, in characters.
-const NAME: usize = 64;
+const MAX_NAME: usize = 64;
 
 /// A worker's report of a finished tile; nothing in it is checked yet.
 pub struct Report {
@@ -46,15 +46,15 @@ pub struct Report {
     pub history: Option<String>,
 }
 
-/// What becomes of it.
+/// The decision on a report.
 pub enum Accepted {
-    /// The tile is done; with how the solver went.
+    /// The tile is done. The text is the solver's history.
     Completion(Box<Completion>, Option<String>),
-    /// Another worker is to compute it, too.
+    /// Another worker must compute the tile too.
     Again,
-    /// The result can't be right.
+    /// The result is impossible for the tile, for this reason.
     Refused(String),
-    /// The frames are missing or are not those that the worker has put.
+    /// The frames are missing or damaged.
     Lost(BlobError),
 }
 
@@ -70,7 +70,7 @@ struct Known {
 }
 
 impl Core {
-    /// Checks a report, and fetches the frames only if all else is possible.
+    /// Checks a report, and fetches the frames if the rest of the report is possible.
     pub async fn accept(
         &self,
         remote: &RemoteTask,
@@ -108,7 +108,7 @@ impl Core {
     /// Looks up the task, the arrays and the shape of a tile that is out.
     async fn known(&self, remote: &RemoteTask) -> Result<Known, EventError> {
         let claimed = self.store.remote_work(remote).await?;
-        let wrong = || PipelineError::Record { what: "task", problem: "it is no tile".into() };
+        let wrong = || PipelineError::Record { what: "task", problem: "it is not a tile".into() };
         let (Work::Job(job), TaskKind::Tile { snapshot, tile, .. }) = (&claimed.work, claimed.kind)
         else {
             return Err(wrong().into());
@@ -127,7 +127,7 @@ impl Core {
         Ok(known.await?.map_err(|error: FormatError| PipelineError::from(error))?)
     }
 
-    /// The record with the residual that the frames have, or why they can't be used.
+    /// Recomputes the residual and puts it into the record. The inner error is the reason why the frames are rejected.
     async fn verified(
         &self,
         known: Known,
@@ -157,7 +157,7 @@ impl Core {
             }
         };
         let stated = std::mem::replace(&mut record.tile.residual, computed);
-        let differs = (stated - computed).abs() > RESIDUAL * computed;
+        let differs = (stated - computed).abs() > RESIDUAL_TOLERANCE * computed;
         Ok(if differs {
             Err(format!("it states a residual of {stated:.4e}, but its frames have {computed:.4e}"))
         } else {
@@ -167,7 +167,7 @@ impl Core {
 }
 
 impl Known {
-    /// Checks all but the frames themselves, and returns the record; else what is wrong.
+    /// Checks everything except the values of the frames, and returns the record. The error is the reason of a refusal.
     fn check(
         &self,
         remote: &RemoteTask,
@@ -183,10 +183,9 @@ impl Known {
         }
         let record = TileTaskRecord::deserialize(&record)
             .map_err(|error| format!("its record can't be read: {error}"))?;
-        let since = Timestamp::now().0.saturating_sub(remote.started_at.0);
-        let elapsed = Duration::from_millis(u64::try_from(since).unwrap_or(0));
-        let wrong = self.wrong_field(&record, progress, elapsed);
-        if let Some(field) = wrong {
+        let elapsed = Timestamp::now().0.saturating_sub(remote.started_at.0);
+        let elapsed = Duration::from_millis(u64::try_from(elapsed).unwrap_or(0));
+        if let Some(field) = self.impossible_field(&record, progress, elapsed) {
             return Err(format!("{field} of its record is impossible for the tile"));
         }
         if history.is_some_and(|text| !is_history(text, MAX_ITERATIONS)) {
@@ -195,8 +194,8 @@ impl Known {
         Ok(record)
     }
 
-    /// The first field of a record that this tile can't have.
-    fn wrong_field(
+    /// Name of the first field with a value that is impossible for this tile.
+    fn impossible_field(
         &self,
         record: &TileTaskRecord,
         progress: &TaskProgress,
@@ -204,39 +203,39 @@ impl Known {
     ) -> Option<&'static str> {
         let TileTask { pieces, schedule, model, .. } = &self.task;
         let TileTaskRecord { tile, solved, assessment, cost } = record;
-        // An end-to-end network is one pass.
-        let most = if model.is_some() { 1 } else { schedule.planned_iterations() };
+        // An end-to-end network needs one pass.
+        let max_iterations = if model.is_some() { 1 } else { schedule.planned_iterations() };
         let [frames, height, width] = self.shape;
         let assessed = model.is_none() && Model::of(schedule).is_some();
         let is_name = |name: &Option<String>| {
             let plain = |c: char| c.is_ascii_graphic() || c == ' ';
-            name.as_ref().is_none_or(|name| name.len() <= NAME && name.chars().all(plain))
+            name.as_ref().is_none_or(|name| name.len() <= MAX_NAME && name.chars().all(plain))
         };
-        let seconds = THREADS * (elapsed.as_secs_f64() + CLOCK);
+        let seconds = MAX_THREADS * (elapsed.as_secs_f64() + CLOCK_TOLERANCE);
         let fields = [
-            ("progress", is_possible(progress) && progress.iterations as usize <= most),
-            ("passes", progress.passes as usize <= most * pieces.len().max(1)),
-            ("iterations", tile.iterations <= most),
-            ("tv_iterations", tile.tv_iterations <= most),
-            ("denoiser_passes", tile.denoiser_passes <= most),
+            ("progress", is_possible(progress) && progress.iterations as usize <= max_iterations),
+            ("passes", progress.passes as usize <= max_iterations * pieces.len().max(1)),
+            ("iterations", tile.iterations <= max_iterations),
+            ("tv_iterations", tile.tv_iterations <= max_iterations),
+            ("denoiser_passes", tile.denoiser_passes <= max_iterations),
             ("residual", tile.residual.is_finite() && tile.residual >= 0.0),
             ("stop_reason", ["converged", "max-iterations"].contains(&tile.stop_reason.as_str())),
             ("solved", solved.iter().copied().eq(pieces.iter().flat_map(Clone::clone))),
             ("assessment", assessment.is_some() == assessed),
-            ("assessment", assessment.iter().all(|one| one.fits(frames, (height, width)))),
+            ("assessment", assessment.iter().all(|values| values.fits(frames, (height, width)))),
             ("provider", is_name(&cost.provider)),
             ("onnxruntime", is_name(&cost.onnxruntime)),
             ("cpu_seconds", (0.0..=seconds).contains(&cost.cpu_seconds)),
-            ("peak_rss_bytes", cost.peak_rss_bytes <= MEMORY),
+            ("peak_rss_bytes", cost.peak_rss_bytes <= MAX_MEMORY),
         ];
-        fields.into_iter().find(|(_, good)| !good).map(|(name, _)| name)
+        fields.into_iter().find(|(_, is_possible)| !is_possible).map(|(name, _)| name)
     }
 }
 
 /// True if the progress is possible for some tile.
 pub fn is_possible(progress: &TaskProgress) -> bool {
-    let most = MAX_ITERATIONS * RunSpec::LONGEST as usize;
+    let max_passes = MAX_ITERATIONS * RunSpec::LONGEST as usize;
     progress.iterations as usize <= MAX_ITERATIONS
-        && progress.passes as usize <= most
+        && progress.passes as usize <= max_passes
         && (0.0..=1.0).contains(&progress.fraction)
 }

@@ -9,7 +9,7 @@ use engine::pipeline::PipelineError;
 use store::RemoteTask;
 
 impl Core {
-    /// Compares a result with that of another worker, if there is one, or decides whether there is to be one.
+    /// Compares a result with that of another worker. Without one, decides whether another worker should compute it.
     pub async fn compare(
         &self,
         remote: &RemoteTask,
@@ -20,17 +20,17 @@ impl Core {
         let first = lock(&self.replays).take(task);
         let Some(first) = first else {
             let pool = remote.pool.parse::<Pool>().ok();
-            let another =
+            let has_another =
                 pool.is_some_and(|pool| lock(&self.presence).has_another(&pool, remote.worker));
             let mut replays = lock(&self.replays);
-            if another && replays.is_wanted(task) {
+            if has_another && replays.is_wanted(task) {
                 replays.keep(task, result);
                 return Ok(Verdict::Again);
             }
             return Ok(Verdict::Accepted(Box::new(result)));
         };
         if first.worker() == result.worker() {
-            // Only where there was no other worker.
+            // This happens if the pool has no other worker.
             return Ok(Verdict::Accepted(Box::new(result)));
         }
         let compared = tokio::task::spawn_blocking(move || {
@@ -56,8 +56,8 @@ impl Core {
         }
     }
 
-    /// True if a worker must leave a tile to another one, because it has computed the tile once. If it is the only
-    /// one of its pool, the result that it has returned is accepted.
+    /// True if a worker must leave a tile to another one, because it has computed the tile before. If it is the only
+    /// worker of its pool, its first result is accepted.
     pub async fn leaves_to_another(
         &self,
         pool: &Pool,
@@ -70,12 +70,12 @@ impl Core {
         if lock(&self.presence).has_another(pool, worker) {
             return Ok(true);
         }
-        let found = self.store.remote_task(task).await?;
-        let Some(remote) = found.filter(|found| found.pool == pool.as_str()) else {
+        let remote = self.store.remote_task(task).await?;
+        let Some(remote) = remote.filter(|remote| remote.pool == pool.as_str()) else {
             return Ok(false);
         };
         let Some(first) = lock(&self.replays).take(task) else { return Ok(false) };
-        tracing::warn!(%task, %worker, "no other worker is left to compute a tile a second time");
+        tracing::warn!(%task, %worker, "no other worker is left to verify a tile; its result is accepted");
         let (completion, _) = first.into_completion()?;
         self.store.complete(&remote.lease(), completion).await?;
         self.clear(pool, task).await;

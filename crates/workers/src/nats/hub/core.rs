@@ -1,4 +1,4 @@
-//! What the parts of the hub share.
+//! State that the parts of the hub share.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -9,68 +9,69 @@ use tokio::sync::{Notify, Semaphore};
 use super::presence::Presence;
 use super::replays::Replays;
 use crate::nats::connection::Connection;
-use crate::nats::message::{Input, Program, Tell};
+use crate::nats::message::{Input, Notice, Program};
 use crate::nats::names;
 use engine::job::{JobId, Pool, Sha256, TaskId, WorkerId};
 use reconstruction::tile::Tile;
 use store::Store;
 
-/// The most windows of masks whose hashes are remembered.
-const WINDOWS: usize = 65_536;
-/// An input that was put longer ago may have grown too old for the stream.
-const FRESH: Duration = Duration::from_secs(12 * 3600);
+/// Largest number of windows of masks with a remembered hash.
+const MAX_WINDOWS: usize = 65_536;
+/// Age up to which an input is surely in the stream, which drops inputs after 24 hours.
+const MAX_INPUT_AGE: Duration = Duration::from_secs(12 * 3600);
 
 /// Tiles whose frames are checked at a time.
 const VERIFIED_AT_ONCE: usize = 2;
-/// Inputs that are put again at a time.
+/// Requests for missing inputs that are handled at a time.
 const PUT_AGAIN_AT_ONCE: usize = 2;
 
-/// A message that is there and is not delivered.
+/// A message that waits in the stream without being delivered.
 #[derive(Debug, Clone, Copy)]
 pub struct Undelivered {
-    /// Its number.
+    /// Sequence number of the message.
     pub seq: i64,
     pub since: Instant,
-    /// Whether the consumer was made anew since.
-    pub again: bool,
+    /// True if the consumer was recreated in the meantime.
+    pub consumer_recreated: bool,
 }
 
-/// What the parts of the hub share.
+/// State that the parts of the hub share.
 pub struct Core {
     pub store: Store,
     pub connection: Connection,
-    /// In whose name tiles are claimed.
+    /// The hub claims tiles under this identifier.
     pub id: WorkerId,
     pub program: Program,
     pub ack_wait: Duration,
-    /// Called when there may be more to hand out.
+    /// Notified when a tile or a worker may have become available.
     pub more: Notify,
     pub presence: Mutex<Presence>,
     /// Results that wait for a second one.
     pub replays: Mutex<Replays>,
     pub verifying: Semaphore,
-    /// Tiles whose inputs are put again, and their turns.
+    /// Tiles with missing inputs that are being sent again.
     pub wanted: Mutex<HashSet<TaskId>>,
     pub putting_again: Semaphore,
-    /// Tiles on their way out, and the jobs of those that are out.
+    /// Tiles that are being published.
     pub sending: Mutex<HashSet<TaskId>>,
+    /// Jobs of the tiles that are out.
     pub jobs: Mutex<HashSet<JobId>>,
-    /// When the stream of tiles was made; another one has other messages under the same numbers.
+    /// Creation time of the stream of tiles. A new stream reuses the sequence numbers.
     pub stream: Mutex<String>,
-    /// Inputs in the stream, and when they were put.
+    /// Inputs in the stream, and when they were sent.
     put: Mutex<HashMap<(Pool, Sha256), Instant>>,
-    /// What windows of prepared masks are as files.
+    /// Hashes and sizes of windows of prepared masks.
     windows: Mutex<HashMap<(Sha256, Tile), Input>>,
-    /// Tiles that wait though workers of their pool wait, too; see `sweep.rs`.
+    /// Tiles that wait although workers of their pool wait too; see `sweep.rs`.
     pub undelivered: Mutex<HashMap<TaskId, Undelivered>>,
-    /// Messages of no tile that is out, by the last sweep.
+    /// Messages that belonged to no tile at the last sweep.
     pub strays: Mutex<HashSet<i64>>,
-    /// The snapshots' window of a tile that is out, which no other tile needs.
+    /// The window of the snapshots of each tile that is out. No other tile needs it.
     snapshots: Mutex<HashMap<TaskId, (Pool, Sha256)>>,
 }
 
 impl Core {
-    /// The hub of a server, with the share of tiles that are computed twice.
+    /// The state of a new hub. `verify_fraction` is the share of tiles that are computed twice.
     pub fn new(
         store: Store,
         connection: Connection,
@@ -100,17 +101,17 @@ impl Core {
         }
     }
 
-    /// Tells a worker something; if it is not heard, the worker's next sign of life brings it up again.
-    pub async fn tell(&self, pool: &Pool, worker: WorkerId, what: Tell) {
-        if let Err(error) = self.connection.say(names::tell(pool, worker), &what).await {
-            tracing::warn!(%error, "a worker can't be told something");
+    /// Sends a notice to a worker. If it is lost, the worker's next sign of life triggers another one.
+    pub async fn notify(&self, pool: &Pool, worker: WorkerId, notice: Notice) {
+        if let Err(error) = self.connection.publish(names::notice(pool, worker), &notice).await {
+            tracing::warn!(%error, "a notice to a worker can't be sent");
         }
     }
 
-    /// Whether an input was put not long ago.
+    /// True if an input was sent recently.
     pub fn is_put(&self, pool: &Pool, sha256: Sha256) -> bool {
         let put = lock(&self.put);
-        put.get(&(pool.clone(), sha256)).is_some_and(|at| at.elapsed() < FRESH)
+        put.get(&(pool.clone(), sha256)).is_some_and(|at| at.elapsed() < MAX_INPUT_AGE)
     }
 
     pub fn note_put(&self, pool: &Pool, sha256: Sha256) {
@@ -121,19 +122,19 @@ impl Core {
         lock(&self.put).remove(&(pool.clone(), sha256));
     }
 
-    /// The streams of files are empty.
+    /// Forgets all inputs, because the streams of files are empty.
     pub fn forget_all_put(&self) {
         lock(&self.put).clear();
     }
 
-    /// What a window of prepared masks is as a file, if that is known.
+    /// Hash and size of a window of prepared masks, if they are known.
     pub fn window(&self, masks: Sha256, tile: Tile) -> Option<Input> {
         lock(&self.windows).get(&(masks, tile)).copied()
     }
 
     pub fn note_window(&self, masks: Sha256, tile: Tile, input: Input) {
         let mut windows = lock(&self.windows);
-        if windows.len() >= WINDOWS {
+        if windows.len() >= MAX_WINDOWS {
             windows.clear();
         }
         windows.insert((masks, tile), input);
@@ -143,25 +144,25 @@ impl Core {
         lock(&self.snapshots).insert(task, (pool.clone(), sha256));
     }
 
-    /// Removes what a tile that has ended leaves in the streams. What stays behind after an error is
-    /// removed when nothing is out, or grows too old.
+    /// Removes the files of a finished tile from the streams. After an error, they are removed when no tile is out, or
+    /// when they expire.
     pub async fn clear(&self, pool: &Pool, task: TaskId) {
         let snapshots = lock(&self.snapshots).remove(&task);
         let outputs = self.connection.purge(names::OUTPUTS, names::outputs(pool, task));
         if let Err(error) = outputs.await {
-            tracing::warn!(%error, "the chunks of a tile stay");
+            tracing::warn!(%error, "the chunks of a tile can't be removed");
         }
         if let Some((pool, sha256)) = snapshots {
             self.forget_put(&pool, sha256);
             let subjects = format!("{}.>", names::input(&pool, sha256));
             if let Err(error) = self.connection.purge(names::INPUTS, subjects).await {
-                tracing::warn!(%error, "the window of a tile stays");
+                tracing::warn!(%error, "the window of a tile can't be removed");
             }
         }
     }
 }
 
-pub fn lock<T>(place: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Whole values are stored: a poisoned lock holds a good one.
-    place.lock().unwrap_or_else(PoisonError::into_inner)
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every change is a single assignment, so the value is valid even if a thread panicked.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

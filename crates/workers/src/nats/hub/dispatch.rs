@@ -1,4 +1,4 @@
-//! Hands tiles out: claims them through the store, cuts their windows, puts what is absent, publishes.
+//! Hands tiles out: claims them from the store, cuts their windows, sends missing inputs, and publishes messages.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,7 +11,7 @@ use super::core::{Core, lock};
 use super::figures;
 use crate::local::tile_task;
 use crate::nats::connection::ClusterError;
-use crate::nats::message::{Input, TaskMessage, Tell};
+use crate::nats::message::{Input, Notice, TaskMessage};
 use crate::nats::{arrays, names};
 use crate::transport::TileTask;
 use engine::job::{Pool, Sha256, TaskKind, without_paths};
@@ -21,17 +21,17 @@ use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use store::{Claimant, ClaimedTask, MessagePlace, RemoteTask, StoreError, Work};
 
-/// Time between looks for tiles, and for jobs that are wanted no more.
+/// Time between searches for tiles and for cancelled jobs.
 const TICK: Duration = Duration::from_millis(200);
-/// Tiles whose windows are cut and put at a time.
+/// Tiles that are prepared and published at a time.
 const AT_ONCE: usize = 4;
-/// Pause after the store or the message server has failed.
-const TROUBLE: Duration = Duration::from_secs(2);
+/// Pause after a failure of the store or the message server.
+const RETRY_PAUSE: Duration = Duration::from_secs(2);
 
-/// Why a tile could not be sent.
+/// Failure to send a tile.
 #[derive(Debug, thiserror::Error)]
 enum SendError {
-    /// The tile's own fault.
+    /// The tile's input is the cause.
     #[error(transparent)]
     Tile(#[from] PipelineError),
     #[error(transparent)]
@@ -47,7 +47,7 @@ impl From<FormatError> for SendError {
 }
 
 impl Core {
-    /// Hands tiles out for as long as this is awaited.
+    /// Hands tiles out until the future is dropped.
     pub async fn dispatch(self: Arc<Self>) {
         let permits = Arc::new(Semaphore::new(AT_ONCE));
         loop {
@@ -67,7 +67,7 @@ impl Core {
                     Ok(None) => break,
                     Err(error) => {
                         tracing::error!(%error, "no tile can be claimed");
-                        tokio::time::sleep(TROUBLE).await;
+                        tokio::time::sleep(RETRY_PAUSE).await;
                         break;
                     }
                 }
@@ -79,8 +79,8 @@ impl Core {
         }
     }
 
-    /// The next tile, and the pool that has most room for it; none if there is no tile, or no pool with
-    /// room: two tiles for each worker may be out.
+    /// Claims the next tile for the pool with the most room. A pool has room for two tiles per worker. Returns `None`
+    /// if there is no tile, or no pool with room.
     async fn next(&self) -> Result<Option<(Pool, ClaimedTask)>, StoreError> {
         let pools = lock(&self.presence).pools();
         if pools.values().all(|(workers, _)| *workers == 0) {
@@ -98,7 +98,7 @@ impl Core {
         Ok(claimed.map(|task| (pool, task)))
     }
 
-    /// Sends a tile to a pool, and does not give up while the tile is the hub's.
+    /// Sends a tile to a pool. Retries as long as the hub holds the tile.
     pub async fn send(&self, pool: &Pool, claimed: ClaimedTask) {
         let lease = claimed.lease;
         if !lock(&self.sending).insert(lease.task) {
@@ -116,9 +116,9 @@ impl Core {
                     Err(error) => tracing::error!(%error, "the failure is not recorded"),
                 }
             }
-            tokio::time::sleep(TROUBLE).await;
-            let found = self.store.remote_task(lease.task).await;
-            if !found.is_ok_and(|found| found.is_some_and(|found| found.attempt == lease.attempt)) {
+            tokio::time::sleep(RETRY_PAUSE).await;
+            let task = self.store.remote_task(lease.task).await;
+            if !task.is_ok_and(|task| task.is_some_and(|task| task.attempt == lease.attempt)) {
                 break;
             }
         }
@@ -148,9 +148,9 @@ impl Core {
         Ok(())
     }
 
-    /// Puts all that a tile needs, as far as it is absent.
+    /// Sends the inputs of a tile that are missing in the stream, and returns the tile's message.
     async fn prepare(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<TaskMessage, SendError> {
-        let wrong = || PipelineError::Record { what: "task", problem: "it is no tile".into() };
+        let wrong = || PipelineError::Record { what: "task", problem: "it is not a tile".into() };
         let Work::Job(job) = &claimed.work else { return Err(wrong().into()) };
         let TaskKind::Tile { snapshot, tile, .. } = claimed.kind else {
             return Err(wrong().into());
@@ -175,7 +175,7 @@ impl Core {
         Ok(TaskMessage { task, attempt, job, cost, tile, masks, snapshots, model })
     }
 
-    /// A window of a prepared array, as a file.
+    /// Cuts a window of a prepared array, and serializes it.
     async fn cut(&self, task: &TileTask, part: Part) -> Result<Vec<u8>, PipelineError> {
         let sha256 = if part == Part::Masks { task.masks } else { task.measurement };
         let (path, task) = (self.store.dir().blob(&sha256), task.clone());
@@ -197,7 +197,7 @@ impl Core {
         self.put_input(pool, read.map_err(failed)?).await
     }
 
-    /// Puts a file into the stream of inputs, unless it is there.
+    /// Puts a file into the stream of inputs, unless it was sent recently.
     async fn put_input(&self, pool: &Pool, bytes: Vec<u8>) -> Result<Input, SendError> {
         let hashed = tokio::task::spawn_blocking(move || (Sha256::of(&bytes), bytes)).await;
         let (sha256, bytes) = hashed.map_err(|_| PipelineError::Thread)?;
@@ -210,7 +210,7 @@ impl Core {
         Ok(Input { sha256, bytes: size as u64 })
     }
 
-    /// Puts an input again that a worker can't find.
+    /// Sends an input again that a worker can't find.
     pub async fn put_again(&self, remote: &RemoteTask, pool: &Pool, sha256: Sha256) {
         self.forget_put(pool, sha256);
         let again = async {
@@ -218,26 +218,25 @@ impl Core {
             self.prepare(pool, &claimed).await
         };
         match again.await {
-            Ok(_) => tracing::info!(%sha256, "an input that a worker could not find is put again"),
-            Err(error) => tracing::warn!(%error, "an input can't be put again"),
+            Ok(_) => tracing::info!(%sha256, "an input that a worker could not find is sent again"),
+            Err(error) => tracing::warn!(%error, "an input can't be sent again"),
         }
     }
 
-    /// Parts with the tiles of jobs that are not wanted any more: tells their workers, and takes those
-    /// back that no living worker has.
+    /// Calls off the tiles of cancelled jobs: notifies their workers, and takes back those that no living worker has.
     async fn call_off(&self) -> Result<(), StoreError> {
         let jobs: Vec<_> = lock(&self.jobs).iter().copied().collect();
         let unwanted = self.store.unwanted_jobs(&jobs).await?;
         if unwanted.is_empty() {
             return Ok(());
         }
-        let mut left = false;
+        let mut any_out = false;
         for remote in self.store.remote_tasks().await?.into_iter().filter(|remote| !remote.wanted) {
             let Ok(pool) = remote.pool.parse::<Pool>() else { continue };
-            left = true;
+            any_out = true;
             if remote.delivery > 0 && lock(&self.presence).lives(remote.worker) {
                 let (task, attempt) = (remote.task, remote.attempt);
-                self.tell(&pool, remote.worker, Tell::Cancel { task, attempt }).await;
+                self.notify(&pool, remote.worker, Notice::Cancel { task, attempt }).await;
             } else if !lock(&self.sending).contains(&remote.task) {
                 self.store.give_back(&remote.lease()).await?;
                 if let Some(place) = &remote.place {
@@ -246,14 +245,14 @@ impl Core {
                 self.clear(&pool, remote.task).await;
             }
         }
-        if !left {
+        if !any_out {
             lock(&self.jobs).retain(|job| !unwanted.contains(job));
         }
         Ok(())
     }
 }
 
-/// Which array a window is cut from.
+/// The array from which a window is cut.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Part {
     Masks,

@@ -1,10 +1,10 @@
-//! Why what a worker says is left for later.
+//! Errors that postpone a worker's message.
 
 use crate::nats::connection::ClusterError;
 use engine::pipeline::PipelineError;
 use store::StoreError;
 
-/// Why an event is left for later.
+/// Reason for which an event is postponed.
 #[derive(Debug, thiserror::Error)]
 pub enum EventError {
     #[error(transparent)]
@@ -17,15 +17,15 @@ pub enum EventError {
     Thread(#[from] tokio::task::JoinError),
     #[error("the frames can't be fetched: {0}")]
     Fetch(String),
-    #[error("the tile's own arrays can't be read: {0}")]
+    #[error("the tile's arrays can't be read: {0}")]
     Tile(#[from] PipelineError),
 }
 
 impl EventError {
-    /// True if the event may be the cause; false if a disk or a message server has failed.
+    /// True if the event may be the cause. False if a disk or a message server has failed.
     pub fn is_of_event(&self) -> bool {
         match self {
-            Self::Store(error) => !error.is_disk_full(),
+            Self::Store(error) => error.disk_trouble().is_none(),
             Self::Thread(_) | Self::Tile(_) => true,
             Self::Cluster(_) | Self::Write(_) | Self::Fetch(_) => false,
         }

@@ -1,8 +1,8 @@
-//! How tiles ended: fetches the frames, has them checked, and tells the store.
+//! Handles events, the reports on finished tiles: fetches and checks the frames, and updates the store.
 //!
-//! The events of each pool are handled on their own, a few at a time, so that what holds up those of one pool holds
-//! up no other. Nothing that an event says is believed before it was checked, and an event that can't be
-//! handled is acknowledged like any other: it costs its tile an attempt at most.
+//! Each pool has a separate loop that handles a few events at a time, so that pools do not delay each other.
+//! Workers are not trusted: all parts of an event are checked. An event that can't be handled is acknowledged like
+//! any other. It costs its tile at most one attempt.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -28,23 +28,25 @@ use crate::nats::setup::EVENT_WAIT;
 use engine::job::Pool;
 use store::{Heartbeat, RemoteBeat, RemoteTask, StagedBlob};
 
-/// How long a request for events waits.
+/// Time that a request for events waits at the message server.
 const PULL: Duration = Duration::from_secs(5);
-/// Events of a pool that are dealt with at a time.
+/// Events of a pool that are handled at a time.
 const AT_ONCE: usize = 4;
-/// Looks for chunks that a replica may not have yet, and the time between them.
-const LOOKS: (u32, Duration) = (10, Duration::from_millis(500));
-/// Pause after the message server has failed.
-const TROUBLE: Duration = Duration::from_secs(2);
-/// Time between looks for pools whose events nobody takes.
+/// Attempts to fetch a chunk that a replica may not have yet.
+const FETCH_ATTEMPTS: u32 = 10;
+/// Time between two attempts to fetch a chunk.
+const FETCH_PAUSE: Duration = Duration::from_millis(500);
+/// Pause after a failure of the message server.
+const RETRY_PAUSE: Duration = Duration::from_secs(2);
+/// Time between searches for pools without a loop.
 const TICK: Duration = Duration::from_secs(1);
-/// Deliveries of an event that the store refuses; then the attempt ends. About three minutes.
+/// Deliveries after which an event that the store refuses ends the attempt. They take about three minutes.
 const MAX_DELIVERIES: i64 = 100;
-/// The longest reason of a failure that is kept, in characters.
-const REASON: usize = 1000;
+/// Longest reason of a failure that is kept, in characters.
+const MAX_REASON: usize = 1000;
 
 impl Core {
-    /// Deals with the events of all pools for as long as this is awaited.
+    /// Handles the events of all pools until the future is dropped.
     pub async fn take_events(self: Arc<Self>) {
         let mut takers: HashMap<Pool, JoinHandle<()>> = HashMap::new();
         loop {
@@ -77,55 +79,55 @@ impl Core {
     }
 
     async fn take_events_of(self: Arc<Self>, pool: Pool) {
-        let hands = Arc::new(Semaphore::new(AT_ONCE));
+        let permits = Arc::new(Semaphore::new(AT_ONCE));
         loop {
-            if let Err(error) = self.take_some(&pool, &hands).await {
-                tracing::warn!(%error, %pool, "no events can be had");
-                tokio::time::sleep(TROUBLE).await;
+            if let Err(error) = self.take_batch(&pool, &permits).await {
+                tracing::warn!(%error, %pool, "events can't be fetched");
+                tokio::time::sleep(RETRY_PAUSE).await;
             }
         }
     }
 
-    /// Takes as many events as can be dealt with at once, and waits for the next free hand.
-    async fn take_some(
+    /// Fetches as many events as there are permits, and handles each in a separate task.
+    async fn take_batch(
         self: &Arc<Self>,
         pool: &Pool,
-        hands: &Arc<Semaphore>,
+        permits: &Arc<Semaphore>,
     ) -> Result<(), ClusterError> {
         let failed = ClusterError::nats("ask for events");
         // The semaphore is never closed.
-        let Ok(mut hand) = hands.clone().acquire_owned().await else { return Ok(()) };
+        let Ok(mut permit) = permits.clone().acquire_owned().await else { return Ok(()) };
         let consumer = self.connection.events(pool).await?;
-        let count = 1 + hands.available_permits();
+        let count = 1 + permits.available_permits();
         let batch = consumer.batch().max_messages(count).expires(PULL).messages();
         let batch = batch.await.map_err(failed)?;
-        // A pull may be forgotten when the stream's leader changes.
-        let mut batch = pin!(batch.take_until(tokio::time::sleep(PULL + TROUBLE)));
+        // The server may forget a pull when the stream's leader changes.
+        let mut batch = pin!(batch.take_until(tokio::time::sleep(PULL + RETRY_PAUSE)));
         while let Some(message) = batch.next().await {
             match message {
                 Ok(message) => {
                     let (hub, pool) = (self.clone(), pool.clone());
                     tokio::spawn(async move {
                         hub.take(&pool, &message).await;
-                        drop(hand);
+                        drop(permit);
                     });
-                    let Ok(next) = hands.clone().acquire_owned().await else { return Ok(()) };
-                    hand = next;
+                    let Ok(next) = permits.clone().acquire_owned().await else { return Ok(()) };
+                    permit = next;
                 }
-                Err(error) => tracing::warn!(%error, "an event can't be had"),
+                Err(error) => tracing::warn!(%error, "an event can't be fetched"),
             }
         }
         Ok(())
     }
 
-    /// Handles an event, and tells NATS that it is in progress until then.
+    /// Handles an event, and extends its delivery at NATS while it does.
     async fn take(self: &Arc<Self>, pool: &Pool, message: &Message) {
         let event = serde_json::from_slice::<Event>(&message.payload);
-        let mut dealing =
+        let mut handling =
             pin!(AssertUnwindSafe(self.try_take(pool, message, event)).catch_unwind());
-        let dealt = loop {
+        let handled = loop {
             tokio::select! {
-                dealt = &mut dealing => break dealt,
+                handled = &mut handling => break handled,
                 () = tokio::time::sleep(EVENT_WAIT / 3) => {
                     if let Err(error) = message.ack_with(AckKind::Progress).await {
                         tracing::debug!(%error, "an event may be delivered again");
@@ -133,19 +135,19 @@ impl Core {
                 }
             }
         };
-        let kind = match dealt {
+        let kind = match handled {
             Ok(Ok(())) => AckKind::Ack,
             Ok(Err(error)) => {
-                tracing::warn!(%error, "an event is left for later");
-                AckKind::Nak(Some(TROUBLE))
+                tracing::warn!(%error, "an event is postponed");
+                AckKind::Nak(Some(RETRY_PAUSE))
             }
             Err(_) => {
-                tracing::error!(%pool, "an event made the server's code panic; it is dropped");
+                tracing::error!(%pool, "an event caused a panic in the server; it is dropped");
                 AckKind::Ack
             }
         };
         if let Err(error) = message.ack_with(kind).await {
-            tracing::warn!(%error, "an event will come again");
+            tracing::warn!(%error, "an event can't be acknowledged; it is delivered again");
         }
         if let Ok(info) = message.info() {
             let age = std::time::SystemTime::now().duration_since(info.published.into());
@@ -169,24 +171,24 @@ impl Core {
             }
         };
         let task = event.task;
-        let dealt = self.deal(pool, event).await;
+        let handled = self.handle(pool, event).await;
         let deliveries = message.info().map_or(1, |info| info.delivered);
-        match dealt {
+        match handled {
             Err(error) if error.is_of_event() && deliveries >= MAX_DELIVERIES => {
-                tracing::error!(%error, %task, deliveries, "an event can't be dealt with");
+                tracing::error!(%error, %task, deliveries, "an event can't be handled");
                 if let Some(remote) = self.store.remote_task(task).await? {
-                    self.store.remote_lost(&remote, "its report can't be dealt with").await?;
+                    self.store.remote_lost(&remote, "its report can't be handled").await?;
                 }
                 Ok(())
             }
-            dealt => dealt,
+            handled => handled,
         }
     }
 
-    async fn deal(&self, pool: &Pool, event: Event) -> Result<(), EventError> {
+    async fn handle(&self, pool: &Pool, event: Event) -> Result<(), EventError> {
         let Event { task, attempt, worker, .. } = event;
         let prefix = names::output(pool, task, attempt, worker);
-        let Some(remote) = self.ended_by(pool, &event).await? else {
+        let Some(remote) = self.task_of(pool, &event).await? else {
             tracing::info!(%task, attempt, %worker, "a report is refused: the attempt is not the worker's");
             figures::refused(1);
             self.connection.purge(names::OUTPUTS, format!("{prefix}.>")).await?;
@@ -208,7 +210,7 @@ impl Core {
                         }
                     }
                     Accepted::Again => {
-                        tracing::info!(%task, attempt, %worker, "a tile is computed a second time");
+                        tracing::info!(%task, attempt, %worker, "another worker verifies a tile");
                     }
                     Accepted::Refused(reason) => {
                         tracing::error!(%task, attempt, %worker, reason, "a worker's result is rejected");
@@ -219,9 +221,7 @@ impl Core {
                     Accepted::Lost(error) => {
                         tracing::warn!(%error, %task, attempt, %worker, "a tile's frames are lost");
                         figures::repaired(1);
-                        self.store
-                            .remote_lost(&remote, "its frames were lost on their way")
-                            .await?;
+                        self.store.remote_lost(&remote, "its frames were lost in transit").await?;
                     }
                 }
             }
@@ -232,7 +232,7 @@ impl Core {
             }
             End::Died { how, fault } => {
                 let how = readable(&how);
-                tracing::warn!(%task, attempt, %worker, how, "a worker has died in a tile");
+                tracing::warn!(%task, attempt, %worker, how, "a worker has died while it computed a tile");
                 self.store.remote_died(&remote, &how, fault).await?;
             }
             End::GivenBack => self.store.give_back(&lease).await?,
@@ -241,16 +241,16 @@ impl Core {
         Ok(())
     }
 
-    /// The tile that an event ends; none unless the worker has begun the attempt. A worker that began while the
-    /// server was down is heard now.
-    async fn ended_by(&self, pool: &Pool, event: &Event) -> Result<Option<RemoteTask>, EventError> {
+    /// Finds the tile of an event. Returns `None` if the worker does not own the attempt. If the worker began while the
+    /// server was down, its begin is recorded now.
+    async fn task_of(&self, pool: &Pool, event: &Event) -> Result<Option<RemoteTask>, EventError> {
         let &Event { task, attempt, worker, seq, delivery, .. } = event;
-        let found = self.store.remote_task(task).await?;
-        let Some(found) = found.filter(|found| found.pool == pool.as_str()) else {
+        let remote = self.store.remote_task(task).await?;
+        let Some(remote) = remote.filter(|remote| remote.pool == pool.as_str()) else {
             return Ok(None);
         };
-        if (found.attempt, found.worker) == (attempt, worker) {
-            return Ok(Some(found));
+        if (remote.attempt, remote.worker) == (attempt, worker) {
+            return Ok(Some(remote));
         }
         let begin = Begin { task, attempt, seq, delivery, worker };
         match self.begin(pool, begin).await? {
@@ -259,7 +259,7 @@ impl Core {
         }
     }
 
-    /// Brings frames to the disk, chunk by chunk: memory holds a few chunks, whatever the size.
+    /// Writes frames to the disk chunk by chunk. Memory holds only a few chunks.
     pub async fn fetch(
         &self,
         prefix: &str,
@@ -267,7 +267,7 @@ impl Core {
     ) -> Result<Result<StagedBlob, BlobError>, EventError> {
         let store = self.store.clone();
         let mut writer = tokio::task::spawn_blocking(move || store.blob_writer()).await??;
-        let (mut next, mut looks) = (0, 0);
+        let (mut next, mut attempts) = (0, 0);
         loop {
             let mut chunks =
                 pin!(self.connection.chunks(names::OUTPUTS, prefix, frames.bytes, next));
@@ -290,20 +290,20 @@ impl Core {
             if !missing {
                 break;
             }
-            looks += 1;
-            if looks == LOOKS.0 {
+            attempts += 1;
+            if attempts == FETCH_ATTEMPTS {
                 return Ok(Err(BlobError::Missing));
             }
-            tokio::time::sleep(LOOKS.1).await;
+            tokio::time::sleep(FETCH_PAUSE).await;
         }
         let staged = tokio::task::spawn_blocking(move || writer.finish()).await??;
-        let whole = staged.sha256() == frames.sha256;
-        Ok(if whole { Ok(staged) } else { Err(BlobError::Damaged) })
+        let is_intact = staged.sha256() == frames.sha256;
+        Ok(if is_intact { Ok(staged) } else { Err(BlobError::Damaged) })
     }
 }
 
-/// A worker's text as it may stand in a log and on a page: one line, not too long.
+/// Makes a worker's text safe for logs and pages: one line of limited length.
 pub fn readable(text: &str) -> String {
     let plain = |c: char| if c.is_control() { ' ' } else { c };
-    text.chars().take(REASON).map(plain).collect()
+    text.chars().take(MAX_REASON).map(plain).collect()
 }

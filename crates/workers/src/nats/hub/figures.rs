@@ -1,10 +1,10 @@
-//! Figures for Prometheus.
+//! Metrics for Prometheus.
 
 use metrics::{Unit, counter, describe_counter, describe_gauge, gauge};
 
 use engine::job::Pool;
 
-/// Describes the figures of the hub.
+/// Describes the metrics of the hub.
 pub fn describe() {
     describe_gauge!("sci_recon_cluster_workers", "Workers on other machines, by pool.");
     describe_gauge!("sci_recon_cluster_tiles_out", "Tiles that are out with a pool.");
@@ -14,11 +14,12 @@ pub fn describe() {
     );
     describe_counter!(
         "sci_recon_cluster_refused_total",
-        "Reports that came too late, a second time, from another worker, or in no readable form."
+        "Reports that were refused: late, repeated, from the wrong worker, or unreadable."
     );
     describe_counter!(
         "sci_recon_cluster_rejected_total",
-        "Results of workers that were rejected: impossible values, a wrong residual, or another worker disagrees."
+        "Results of workers that were rejected: impossible values, a wrong residual, or a result that differs from \
+         another worker's."
     );
     describe_counter!(
         "sci_recon_cluster_replayed_total",
@@ -40,7 +41,7 @@ pub fn describe() {
     describe_gauge!(
         "sci_recon_cluster_lag_seconds",
         Unit::Seconds,
-        "Time from the last report of a worker to its being dealt with."
+        "Time that the latest report of a worker waited until it was handled."
     );
     redelivered(0);
     refused(0);

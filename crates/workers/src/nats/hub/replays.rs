@@ -1,5 +1,5 @@
-//! Tiles that are computed a second time, by another worker, before they are accepted. A worker that returns
-//! plausible frames that are wrong is found in no other way.
+//! Tiles that two workers compute before the result is accepted. There is no other way to detect a worker that
+//! returns plausible but wrong frames.
 
 use std::collections::{HashMap, HashSet};
 use std::time::{Duration, Instant};
@@ -14,11 +14,11 @@ use store::{Completion, Product, StagedBlob};
 ///
 /// Workers of one version on processors of one kind return the same bits. Others round differently, which changes
 /// frames by some 1e-5. 0.01 is a PSNR of 40 dB, above which assessments distinguish nothing either.
-const DIFFERENCE: f64 = 0.01;
-/// A first result is dropped after so long: the tile was given up, or was computed by the server's own worker.
-const KEPT: Duration = Duration::from_secs(3600);
+const MAX_DIFFERENCE: f64 = 0.01;
+/// Time after which an uncompared result is dropped. The tile was abandoned, or a worker of the server computed it.
+const MAX_AGE: Duration = Duration::from_secs(3600);
 
-/// A result that has passed all checks and may wait for a second one.
+/// The first result of a tile. It has passed all checks and may wait for a second one.
 #[derive(Debug)]
 pub struct First {
     worker: WorkerId,
@@ -29,11 +29,11 @@ pub struct First {
     history: Option<String>,
 }
 
-/// What comes of a result.
+/// The decision on a result.
 #[derive(Debug)]
 pub enum Verdict {
     Accepted(Box<First>),
-    /// It is kept, and another worker is to compute the tile, too.
+    /// The result is kept until another worker has computed the tile.
     Again,
     /// Two workers disagree.
     Differs(String),
@@ -54,14 +54,14 @@ impl Replays {
         Self { fraction, firsts: HashMap::new(), disputed: HashSet::new() }
     }
 
-    /// Who has computed a tile that another worker is to compute, too.
+    /// The worker that has computed a tile which waits for a second worker.
     pub fn first_worker(&self, task: TaskId) -> Option<WorkerId> {
         self.firsts.get(&task).map(|first| first.worker)
     }
 
-    /// Drops what nobody asks for any more.
+    /// Drops results that no second worker will confirm.
     pub fn drop_old(&mut self) {
-        self.firsts.retain(|_, first| first.since.elapsed() < KEPT);
+        self.firsts.retain(|_, first| first.since.elapsed() < MAX_AGE);
     }
 
     /// Keeps a result until another worker has computed the tile.
@@ -74,7 +74,7 @@ impl Replays {
         self.firsts.remove(&task)
     }
 
-    /// Notes whether workers agree about a tile.
+    /// Records whether two workers agree on a tile.
     pub fn judge(&mut self, task: TaskId, agree: bool) {
         if agree {
             self.disputed.remove(&task);
@@ -100,7 +100,7 @@ impl First {
         Self { worker, since: Instant::now(), frames, progress, record, history }
     }
 
-    /// Who has computed it.
+    /// The worker that computed the result.
     pub fn worker(&self) -> WorkerId {
         self.worker
     }
@@ -112,17 +112,17 @@ impl First {
         Ok((Completion { progress: self.progress, record, product }, self.history))
     }
 
-    /// Why two results differ; none if they don't.
+    /// Describes the difference of two results. Returns `None` if they agree.
     pub fn difference(&self, other: &Self, white: f32) -> Result<Option<String>, PipelineError> {
         if self.frames.sha256() == other.frames.sha256() {
             let agree = match (&self.record.assessment, &other.record.assessment) {
-                (Some(one), Some(other)) => one.agrees_with(other),
-                (one, other) => one.is_none() && other.is_none(),
+                (Some(first), Some(second)) => first.agrees_with(second),
+                (first, second) => first.is_none() && second.is_none(),
             };
             return Ok((!agree).then(|| "the assessments of equal frames differ".into()));
         }
-        let found = relative_difference(self.frames.path(), other.frames.path(), white)?;
-        let differs = !found.is_finite() || found > DIFFERENCE;
-        Ok(differs.then(|| format!("frames differ by {found:.2e} of the white level")))
+        let difference = relative_difference(self.frames.path(), other.frames.path(), white)?;
+        let differs = !difference.is_finite() || difference > MAX_DIFFERENCE;
+        Ok(differs.then(|| format!("frames differ by {difference:.2e} of the white level")))
     }
 }

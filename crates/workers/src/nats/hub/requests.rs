@@ -1,4 +1,4 @@
-//! What workers ask and tell without a stream: hello, begin, signs of life, inputs that are missing.
+//! Handles the messages of workers outside the streams: hello, begin, signs of life, and missing inputs.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -13,33 +13,34 @@ use super::accept::is_possible;
 use super::core::{Core, lock};
 use super::error::EventError;
 use super::figures;
+use super::presence::MAX_WORKERS;
 use crate::nats::connection::ClusterError;
-use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Tell, TileBeat, Want};
+use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Notice, TileBeat, Want};
 use crate::nats::names;
 use engine::job::Pool;
 use engine::pipeline::progress::is_history;
 use reconstruction::schedule::MAX_ITERATIONS;
-use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
+use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace, WorkerTakes};
 
-/// Time between two transactions for what workers tell.
+/// Time between two transactions that record signs of life.
 const FLUSH: Duration = Duration::from_secs(1);
-/// Requests that are dealt with at a time.
+/// Messages of one kind that are handled at a time.
 const AT_ONCE: usize = 64;
 /// Longest name of a host or a device, in bytes.
-const NAME: usize = 255;
+const MAX_NAME: usize = 255;
 
 impl Core {
-    /// Listens to what workers ask.
+    /// Subscribes to the messages of this kind from all pools.
     ///
     /// # Errors
-    /// If the message server does not let it.
-    pub async fn listen(&self, what: &str) -> Result<Subscriber, ClusterError> {
-        let subscribed = self.connection.client.subscribe(format!("sci.v1.{what}.*")).await;
+    /// If the message server denies the subscription.
+    pub async fn listen(&self, kind: &str) -> Result<Subscriber, ClusterError> {
+        let subscribed = self.connection.client.subscribe(format!("sci.v1.{kind}.*")).await;
         subscribed.map_err(ClusterError::nats("listen to workers"))
     }
 
-    pub async fn answer_hellos(self: Arc<Self>, asked: Subscriber) {
-        each(asked, |pool, hello: Hello, message| {
+    pub async fn answer_hellos(self: Arc<Self>, messages: Subscriber) {
+        each(messages, |pool, hello: Hello, message| {
             let hub = self.clone();
             async move {
                 if let Some(answer) = hub.hello(&pool, hello).await {
@@ -50,13 +51,13 @@ impl Core {
         .await;
     }
 
-    pub async fn answer_begins(self: Arc<Self>, asked: Subscriber) {
-        each(asked, |pool, begin: Begin, message| {
+    pub async fn answer_begins(self: Arc<Self>, messages: Subscriber) {
+        each(messages, |pool, begin: Begin, message| {
             let hub = self.clone();
             async move {
                 match hub.begin(&pool, begin).await {
                     Ok(answer) => hub.reply(&message, &answer).await,
-                    // The worker goes on without an answer.
+                    // The worker continues without an answer.
                     Err(error) => tracing::error!(%error, "a worker that begins is not answered"),
                 }
             }
@@ -64,59 +65,61 @@ impl Core {
         .await;
     }
 
-    pub async fn answer_wants(self: Arc<Self>, asked: Subscriber) {
-        each(asked, |pool, want: Want, _| {
+    pub async fn answer_wants(self: Arc<Self>, messages: Subscriber) {
+        each(messages, |pool, want: Want, _| {
             let hub = self.clone();
             async move {
                 match hub.store.remote_task(want.task).await {
                     Ok(Some(remote)) if remote.pool == pool.as_str() => {
-                        // Once at a time, however often a worker asks.
+                        // The requests of a tile are handled one at a time, however often its worker asks.
                         if !lock(&hub.wanted).insert(want.task) {
                             return;
                         }
-                        if let Ok(_turn) = hub.putting_again.acquire().await {
+                        if let Ok(_permit) = hub.putting_again.acquire().await {
                             hub.put_again(&remote, &pool, want.sha256).await;
                         }
                         lock(&hub.wanted).remove(&want.task);
                     }
                     Ok(_) => {}
-                    Err(error) => tracing::error!(%error, "what a worker wants can't be looked up"),
+                    Err(error) => {
+                        tracing::error!(%error, "a request for an input can't be looked up")
+                    }
                 }
             }
         })
         .await;
     }
 
-    pub async fn hear_beats(self: Arc<Self>, told: Subscriber) {
-        each(told, |pool, beat: Beat, _| {
+    pub async fn receive_beats(self: Arc<Self>, messages: Subscriber) {
+        each(messages, |pool, beat: Beat, _| {
             let hub = self.clone();
             async move {
                 if beat.leaves {
                     let known = lock(&hub.presence).leave(beat.worker, &pool);
                     if known && let Err(error) = hub.store.remote_worker_left(beat.worker).await {
-                        tracing::error!(%error, "the end of a worker is not recorded");
+                        tracing::error!(%error, "the departure of a worker is not recorded");
                     }
                 } else if !lock(&hub.presence).sign(beat.worker, &pool, possible(beat.tile)) {
-                    hub.tell(&pool, beat.worker, Tell::Introduce).await;
+                    hub.notify(&pool, beat.worker, Notice::Introduce).await;
                 }
             }
         })
         .await;
     }
 
-    /// Records what workers have told, once a second.
+    /// Records signs of life and progress once a second.
     pub async fn record_beats(self: Arc<Self>) {
         loop {
             tokio::time::sleep(FLUSH).await;
             if let Err(error) = self.flush().await {
-                tracing::error!(%error, "what workers tell is not recorded");
+                tracing::error!(%error, "signs of life are not recorded");
             }
         }
     }
 
     async fn flush(&self) -> Result<(), StoreError> {
-        let (seen, tiles) = lock(&self.presence).news();
-        if seen.is_empty() {
+        let (alive, tiles) = lock(&self.presence).news();
+        if alive.is_empty() {
             return Ok(());
         }
         let beats: Vec<RemoteBeat> = tiles
@@ -130,25 +133,25 @@ impl Core {
                 history: tile.history.clone(),
             })
             .collect();
-        let answers = self.store.remote_beats(&beats, &seen).await?;
+        let answers = self.store.remote_beats(&beats, &alive).await?;
         for ((worker, pool, tile), answer) in tiles.iter().zip(answers) {
             let (task, attempt) = (tile.task, tile.attempt);
             match answer {
                 Heartbeat::Continue => {}
                 Heartbeat::Cancelled => {
-                    self.tell(pool, *worker, Tell::Cancel { task, attempt }).await
+                    self.notify(pool, *worker, Notice::Cancel { task, attempt }).await
                 }
-                Heartbeat::Lost => self.tell(pool, *worker, Tell::Lost { task, attempt }).await,
+                Heartbeat::Lost => self.notify(pool, *worker, Notice::Lost { task, attempt }).await,
             }
         }
         Ok(())
     }
 
-    /// Takes a worker in; none if that has failed and it should ask again.
+    /// Registers a worker. Returns `None` after a failure; the worker then asks again.
     async fn hello(&self, pool: &Pool, hello: Hello) -> Option<HelloAnswer> {
         let Hello { worker, host, pid, device, program } = hello;
         let is_name =
-            |name: &String| name.len() <= NAME && !name.chars().any(|c: char| c.is_control());
+            |name: &String| name.len() <= MAX_NAME && !name.chars().any(|c: char| c.is_control());
         if !is_name(&host) || !is_name(&device) {
             return Some(HelloAnswer::Refused("the name of its host or device is too long".into()));
         }
@@ -156,35 +159,40 @@ impl Core {
             tracing::warn!(%worker, host, reason, "a worker is refused");
             return Some(HelloAnswer::Refused(reason));
         }
+        if !lock(&self.presence).has_room(worker, pool) {
+            tracing::warn!(%worker, host, %pool, "a worker is refused: its pool is full");
+            let reason = format!("the pool is full: it has {MAX_WORKERS} workers");
+            return Some(HelloAnswer::Refused(reason));
+        }
         if let Err(error) = self.connection.make_pool(pool, self.ack_wait).await {
-            tracing::error!(%error, "a pool can't be made");
+            tracing::error!(%error, "the consumer of a pool can't be created");
             return None;
         }
-        let place = WorkerPlace {
+        let location = WorkerPlace {
             host: Some(host.clone()),
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        if let Err(error) = self.store.worker_started(worker, pid, &place, false).await {
+        let started = self.store.worker_started(worker, pid, &location, WorkerTakes::All);
+        if let Err(error) = started.await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
         }
         lock(&self.presence).join(worker, pool);
-        tracing::info!(%worker, host, %pool, "a worker has come");
+        tracing::info!(%worker, host, %pool, "a worker has joined");
         self.more.notify_one();
         let ack_wait_ms = u64::try_from(self.ack_wait.as_millis()).unwrap_or(u64::MAX);
         Some(HelloAnswer::Welcome { ack_wait_ms })
     }
 
-    /// Gives a worker the right to an attempt, if the tile may be its.
+    /// Grants a worker an attempt, if no other worker owns the tile.
     pub async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, EventError> {
         let Begin { task, attempt, seq, delivery, worker } = begin;
         if self.leaves_to_another(pool, task, worker).await? {
             return Ok(BeginAnswer::Another);
         }
         let task = (task, pool.as_str());
-        let begun = self.store.remote_begin(task, (attempt, seq), delivery, worker).await?;
-        Ok(match begun {
+        Ok(match self.store.remote_begin(task, (attempt, seq), delivery, worker).await? {
             Begun::Go(attempt, redelivered) => {
                 lock(&self.presence).begin(worker, task.0);
                 figures::redelivered(u64::from(redelivered));
@@ -197,7 +205,7 @@ impl Core {
 
     async fn reply(&self, message: &Message, answer: &impl Serialize) {
         let Some(to) = &message.reply else { return };
-        if let Err(error) = self.connection.say(to.to_string(), answer).await {
+        if let Err(error) = self.connection.publish(to.to_string(), answer).await {
             tracing::warn!(%error, "a worker can't be answered");
         }
     }
@@ -210,21 +218,23 @@ fn possible(tile: Option<TileBeat>) -> Option<TileBeat> {
     Some(tile)
 }
 
-/// Deals with all that comes, several at a time; what can't be read is left.
-async fn each<T, F>(told: Subscriber, deal: impl Fn(Pool, T, Message) -> F)
+/// Handles all messages of a subscription, several at a time. Unreadable messages are dropped.
+async fn each<T, F>(messages: Subscriber, handle: impl Fn(Pool, T, Message) -> F)
 where
     T: DeserializeOwned,
     F: Future<Output = ()>,
 {
-    let read = told.filter_map(|message| async move {
+    let readable = messages.filter_map(|message| async move {
         let pool = names::pool_of(&message.subject)?;
         match serde_json::from_slice(&message.payload) {
-            Ok(read) => Some((pool, read, message)),
+            Ok(content) => Some((pool, content, message)),
             Err(error) => {
-                tracing::warn!(%error, subject = %message.subject, "a worker says what can't be read");
+                tracing::warn!(%error, subject = %message.subject, "a worker's message can't be read");
                 None
             }
         }
     });
-    read.for_each_concurrent(AT_ONCE, |(pool, read, message)| deal(pool, read, message)).await;
+    readable
+        .for_each_concurrent(AT_ONCE, |(pool, content, message)| handle(pool, content, message))
+        .await;
 }

@@ -1,4 +1,4 @@
-//! The hub from its start to its end.
+//! Starts and ends the hub.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,24 +11,26 @@ use crate::nats::connection::{Access, ClusterError, Connection};
 use crate::nats::message::Program;
 use store::Store;
 
-/// The shortest and the longest pause before the message server is tried again.
-const PAUSES: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(10));
-/// Time between looks at the connection.
-const LOOK: Duration = Duration::from_secs(1);
+/// Shortest pause before the message server is tried again.
+const MIN_PAUSE: Duration = Duration::from_secs(1);
+/// Longest pause before the message server is tried again.
+const MAX_PAUSE: Duration = Duration::from_secs(10);
+/// Time between polls of the connection's state.
+const POLL: Duration = Duration::from_secs(1);
 
-/// How the hub treats workers.
+/// Settings of the hub.
 #[derive(Debug, Clone)]
 pub struct HubSettings {
-    /// The program that workers must be.
+    /// The build that workers must have.
     pub program: Program,
-    /// A message is delivered again when its worker was silent for so long.
+    /// Silence of a worker after which its message is delivered again.
     pub ack_wait: Duration,
-    /// Share of the tiles that a second worker computes, too, on \[0,1\].
+    /// Share of the tiles that a second worker computes too, on \[0,1\].
     pub verify_fraction: f64,
 }
 
-/// The hub, which runs until this is dropped. Tiles that are out stay out, and are known to the next
-/// server by the store.
+/// The running hub. Dropping it ends the hub. Tiles that are out stay out; the next server learns of them from the
+/// store.
 #[derive(Debug)]
 pub struct Hub {
     _running: JoinSet<()>,
@@ -40,12 +42,13 @@ impl Hub {
     #[must_use]
     pub fn start(store: Store, access: Access, settings: HubSettings) -> Self {
         let mut running = JoinSet::new();
-        let (tell, trouble) = watch::channel(Some("there is no connection to NATS yet".to_owned()));
-        running.spawn(run(store, access, settings, tell));
+        let (report, trouble) =
+            watch::channel(Some("there is no connection to NATS yet".to_owned()));
+        running.spawn(run(store, access, settings, report));
         Self { _running: running, trouble }
     }
 
-    /// Why no tiles can be handed out at the moment; none if they can.
+    /// The reason why no tiles can be handed out at the moment, if there is one.
     #[must_use]
     pub fn trouble(&self) -> watch::Receiver<Option<String>> {
         self.trouble.clone()
@@ -56,58 +59,58 @@ async fn run(
     store: Store,
     access: Access,
     settings: HubSettings,
-    tell: watch::Sender<Option<String>>,
+    report: watch::Sender<Option<String>>,
 ) {
-    let connection = persist(&tell, || access.connect()).await;
+    let connection = persist(&report, || access.connect()).await;
     let HubSettings { program, ack_wait, verify_fraction } = settings;
     let core = Core::new(store, connection.clone(), (program, ack_wait), verify_fraction);
     let core = Arc::new(core);
-    persist(&tell, || core.find_streams()).await;
-    let mut parts = persist(&tell, || parts(&core)).await;
+    persist(&report, || core.find_streams()).await;
+    let mut parts = persist(&report, || parts(&core)).await;
     tracing::info!("handing tiles out to other machines");
-    parts.spawn(watch_over(connection, tell));
+    parts.spawn(watch_over(connection, report));
     while let Some(ended) = parts.join_next().await {
         if let Err(error) = ended
             && error.is_panic()
         {
-            tracing::error!(%error, "a part of the hub has died");
+            tracing::error!(%error, "a part of the hub has panicked");
         }
     }
 }
 
-/// Does something again and again until it succeeds, and tells why it does not.
-async fn persist<T, F>(tell: &watch::Sender<Option<String>>, what: impl Fn() -> F) -> T
+/// Repeats an action until it succeeds, and reports its errors.
+async fn persist<T, F>(report: &watch::Sender<Option<String>>, action: impl Fn() -> F) -> T
 where
     F: Future<Output = Result<T, ClusterError>>,
 {
-    let mut pause = PAUSES.0;
+    let mut pause = MIN_PAUSE;
     loop {
-        match what().await {
+        match action().await {
             Ok(done) => return done,
             Err(error) => {
                 tracing::error!(
                     %error,
-                    "no tile leaves this machine: the cluster can't begin to work, and is tried again"
+                    "no tile leaves this machine: the cluster can't start, the server tries again"
                 );
-                tell.send_replace(Some(error.to_string()));
+                report.send_replace(Some(error.to_string()));
             }
         }
         tokio::time::sleep(pause).await;
-        pause = (pause * 2).min(PAUSES.1);
+        pause = (pause * 2).min(MAX_PAUSE);
     }
 }
 
-/// Tells whether the connection is there.
-async fn watch_over(connection: Connection, tell: watch::Sender<Option<String>>) {
+/// Reports when the connection is lost or restored.
+async fn watch_over(connection: Connection, report: watch::Sender<Option<String>>) {
     loop {
         let lost = (!connection.is_up()).then(|| "the connection to NATS is lost".to_owned());
-        tell.send_if_modified(|told| {
-            *told != lost && {
-                *told = lost;
+        report.send_if_modified(|reported| {
+            *reported != lost && {
+                *reported = lost;
                 true
             }
         });
-        tokio::time::sleep(LOOK).await;
+        tokio::time::sleep(POLL).await;
     }
 }
 
@@ -120,7 +123,7 @@ async fn parts(core: &Arc<Core>) -> Result<JoinSet<()>, ClusterError> {
     parts.spawn(core.clone().answer_hellos(hellos));
     parts.spawn(core.clone().answer_begins(begins));
     parts.spawn(core.clone().answer_wants(wants));
-    parts.spawn(core.clone().hear_beats(beats));
+    parts.spawn(core.clone().receive_beats(beats));
     parts.spawn(core.clone().record_beats());
     parts.spawn(core.clone().dispatch());
     parts.spawn(core.clone().take_events());
