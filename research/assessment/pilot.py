@@ -38,7 +38,7 @@ def without(schedule, names):
 
 
 def applies(schedule, name):
-    """Whether a heuristic can change the results of a schedule."""
+    """True if a heuristic can change the results of a schedule."""
     priors = {stage['prior'] for stage in schedule['stages']}
     if name == 'temporal_variation':
         return any(stage.get('temporal_weight') for stage in schedule['stages'])
@@ -48,7 +48,7 @@ def applies(schedule, name):
 
 
 def unchanged(name, decisions):
-    """Whether the pilot decides the same without a heuristic: if it accepted none of its candidates."""
+    """True if the pilot, which accepted none of a heuristic's candidates, decides the same without it."""
     changed = lambda field: any(decided['stage'].get(field) != decided['planned'].get(field) for decided in decisions)
     static = any(decided['stage'].get('static_shrinkage') is not None for decided in decisions)
     return {

@@ -215,6 +215,7 @@ impl Known {
         let fields = [
             ("progress", is_possible(progress) && progress.iterations as usize <= max_iterations),
             ("passes", progress.passes as usize <= max_iterations * pieces.len().max(1)),
+            ("iterations", tile.iterations <= max_iterations),
             ("tv_iterations", tile.tv_iterations <= max_iterations),
             ("denoiser_passes", tile.denoiser_passes <= max_iterations),
             ("residual", tile.residual.is_finite() && tile.residual >= 0.0),
