@@ -25,7 +25,7 @@ use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
 use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
-use engine::pipeline::scale::white;
+use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{check_output, replace_result, write_result};
@@ -150,7 +150,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         (arguments.sequence, snapshots.len() as u32),
         dim,
     )?;
-    let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots)?);
+    let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots.clone())?);
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let threads = arguments.threads.map_or(cores, usize::from);
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
@@ -197,7 +197,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Quality::compare(frame, truth.view(), *channels)
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
-    let recipe = input.recipe(&setup, white, &solved)?;
+    let mut histogram = Histogram::default();
+    (0..frames * snapshots.len()).for_each(|index| histogram.add(&seen(index)));
+    let white_level = white_level(&histogram, white);
+    let recipe = input.recipe(&setup, (white, white_level), &solved)?;
     let expected = |snapshot| {
         let told = solved.assessments(&sequence, snapshot, &recipe.schedule);
         recipe.expected(snapshot, &told)
@@ -349,12 +352,17 @@ impl<'a> Input<'a> {
         self.first..self.first + self.measurement.array.dim().0
     }
 
-    /// The white level of all snapshots, as a job has it.
+    /// The solver's scale for all snapshots, as a job has it.
     fn white(&self) -> Result<f32> {
         Ok(white(self.masks.array.view(), self.measurement.array.view())?)
     }
 
-    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
+    fn recipe(
+        &self,
+        setup: &Setup,
+        (normalisation, white_level): (f32, f32),
+        solved: &Solved,
+    ) -> Result<Recipe> {
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule)?;
         models.extend(setup.model.as_ref().map(Model::record));
@@ -374,7 +382,8 @@ impl<'a> Input<'a> {
             scale: ScaleRecord {
                 masks_full_scale: self.masks.full_scale,
                 measurement_full_scale: self.measurement.full_scale,
-                white,
+                normalisation,
+                white_level,
             },
             tile_plan: setup.plan.clone(),
             runs: setup.runs.clone(),
@@ -435,7 +444,12 @@ struct Report {
     frames: usize,
     height: usize,
     width: usize,
+    /// PSNR relative to the white level, as the expected one.
     psnr_db: Option<f64>,
+    /// PSNR for a data range of 1, as benchmarks state it.
+    psnr_unit_db: Option<f64>,
+    /// The 99.9th percentile of all frames.
+    white_level: f32,
     /// How good the frames are, as far as that can be told without a truth: the mean over the snapshots.
     assessment: Option<Assessment>,
     /// PSNR of each snapshot, where the truth is known.
@@ -471,6 +485,9 @@ impl Report {
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
         let summary = Summary::of(&tiles);
+        let white_level = recipe.scale.white_level;
+        let psnr_unit_db = quality.as_ref().map(|quality| quality.psnr);
+        let quality = quality.map(|quality| quality.relative_to(white_level));
         let by_frame = quality.as_ref().map_or(&[][..], |quality| &quality.frames);
         let mean =
             |of: &[FrameQuality]| of.iter().map(|frame| frame.psnr).sum::<f64>() / of.len() as f64;
@@ -481,6 +498,8 @@ impl Report {
             height,
             width,
             psnr_db: quality.as_ref().map(|quality| quality.psnr),
+            psnr_unit_db,
+            white_level,
             assessment: None,
             psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
             ssim: quality.as_ref().and_then(|quality| quality.ssim),
@@ -544,9 +563,12 @@ impl Report {
                 error(joint.error_together),
             ))?;
         }
-        if let Some(psnr) = self.psnr_db {
+        if let (Some(psnr), Some(unit)) = (self.psnr_db, self.psnr_unit_db) {
             let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
-            print_line(format!("PSNR {psnr:.2} dB{ssim}"))?;
+            print_line(format!(
+                "PSNR {psnr:.2} dB relative to the white level {:.4} ({unit:.2} dB for a data range of 1){ssim}",
+                self.white_level
+            ))?;
         }
         if let Some(out) = &arguments.out {
             print_line(format!("frames are in {}", out.display()))?;

@@ -46,4 +46,5 @@ mod storm;
 mod upgrade;
 mod uploads;
 mod watching;
+mod white_level;
 mod work;

@@ -46,8 +46,8 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     assert_eq!(manifest["run"]["job"], job);
     let whole = app.get(&format!("/v1/jobs/{job}/manifest.json")).await.expect(200).json();
     assert_eq!(whole["content"]["snapshots"][0]["summary"], content["summary"]);
-    // Prepare, preview, six tiles, assemble, manifest.
-    assert_eq!(whole["run"]["tasks"], 10);
+    // Prepare, preview, six tiles, white level, assemble, manifest.
+    assert_eq!(whole["run"]["tasks"], 11);
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

@@ -70,6 +70,7 @@ pub enum FindingCode {
     FastMotion,
     UnfamiliarMasks,
     UnevenError,
+    UnexplainedPixels,
 }
 
 /// The description of a [`FindingCode`].
@@ -332,6 +333,14 @@ impl FindingCode {
                 Warning,
                 "a part of the picture is expected to be much worse than the rest",
                 "look at the map of the expected error before relying on this part",
+            ),
+            Self::UnexplainedPixels => (
+                &[Result],
+                Error,
+                Error,
+                "the frames do not predict pixels that were withheld from the reconstruction",
+                "check that the masks belong to this measurement, unflipped and in its pixel grid, and that the \
+                 measurement is not mostly noise; then calibrate again",
             ),
         };
         Entry { subjects, severity, worst, title, remedy }

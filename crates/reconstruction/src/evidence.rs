@@ -11,6 +11,7 @@ use super::priors::Networks;
 use super::schedule::Schedule;
 use super::signs::Signs;
 use super::solver;
+use super::unmeasured::Measured;
 
 /// Evidence from the crop of the first snapshot that [`crop::choose`] selects; measurement and frames are on the scale on
 /// which the scene is on \[0,1\]. Returns `None` if no light reaches the crop, or the iteration diverges. Costs a run of
@@ -31,9 +32,10 @@ pub fn collect(
         Err(ReconError::DarkMasks { .. }) => return Ok(None),
         other => other?,
     };
-    let hold_out = HoldOut::draw(&whole, 0);
+    let Measured { op: whole, y } = Measured::new(&whole, y.slice(s![..1, rows, columns]));
+    let (whole, y) = (&*whole, y.view());
+    let hold_out = HoldOut::draw(whole, 0);
     let op = whole.clone().without(&hold_out.pixels);
-    let y = y.slice(s![..1, rows, columns]);
     let mut early: Option<Array3<f32>> = None;
     let solved = solver::run_stages(&op, y, schedule, networks, &mut (), |_, frames, _| {
         early.get_or_insert_with(|| frames.clone());
@@ -44,7 +46,7 @@ pub fn collect(
         other => other?,
     };
     let early = early.as_ref().unwrap_or(&outcome.frames);
-    let measurement = HeldOutMeasurement { whole: &whole, op: &op, y, hold_out: &hold_out };
+    let measurement = HeldOutMeasurement { whole, op: &op, y, hold_out: &hold_out };
     Ok(measurement.evidence(schedule, early, &outcome.frames))
 }
 
@@ -69,6 +71,7 @@ impl HeldOutMeasurement<'_> {
         let (early, last) = (early.view(), last.view());
         let signs = Signs::of((self.op, self.y), self.hold_out, early, last)?;
         let early = (schedule.stages.len() > 1).then_some(early);
-        Some(Evidence::new(signs, &features(self.whole, early, last)))
+        let prediction = Some(self.hold_out.prediction(self.op, self.y, last));
+        Some(Evidence { prediction, ..Evidence::new(signs, &features(self.whole, early, last)) })
     }
 }

@@ -16,7 +16,7 @@ pub mod error;
 pub mod evidence;
 mod fields;
 mod gap;
-mod hold_out;
+pub mod hold_out;
 mod iterate;
 pub mod joints;
 pub mod learned;
@@ -39,5 +39,6 @@ pub mod stage;
 mod static_regions;
 pub mod tile;
 mod trial;
+pub mod unmeasured;
 
 pub use error::ReconError;

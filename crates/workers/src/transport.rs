@@ -107,7 +107,7 @@ pub struct Claim {
 /// What is to be done, with all that is needed.
 #[derive(Debug)]
 pub enum TaskInput {
-    /// Estimate the white level of a job.
+    /// Estimate the solver's scale of a job.
     Prepare {
         arrays: Arrays,
         snapshots: SnapshotRange,
@@ -128,6 +128,12 @@ pub enum TaskInput {
         mosaic: Option<Mosaic>,
     },
     Tile(Box<TileTask>),
+    /// Determine the white level of all frames of a job from all its tiles.
+    White {
+        recipe: Box<Recipe>,
+        snapshots: SnapshotRange,
+        tiles: Vec<StoredTile>,
+    },
     /// Blend all tiles of the runs that hold a snapshot, and write its frames to the folder.
     Assemble {
         job: JobId,

@@ -4,18 +4,30 @@
 use axum::Json;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::super::download::Download;
 use super::super::error::{ApiError, Code, Result};
+use super::super::extract::QueryOf;
+use super::super::pictures;
 use super::super::results::{file_name, media_type};
 use super::clip::Clip;
 use engine::job::MIN_MOVIE_SIDE;
+use engine::pipeline::movie::DisplayWindow;
 use store::{Movie, StoreError};
 
 const NAME: &str = "movie.mp4";
 /// Seconds after which to ask again.
 const AGAIN: HeaderValue = HeaderValue::from_static("1");
+
+/// Values to show as black and as white instead of 0 and the job's white level.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(in crate::http) struct WindowQuery {
+    black: Option<f32>,
+    white: Option<f32>,
+}
 
 /// A movie that is not there yet.
 #[derive(Debug, Serialize)]
@@ -28,6 +40,7 @@ struct MovieBody {
 /// `movie.mp4`: AV1, at ten frames a second.
 pub(in crate::http) async fn movie(
     clip: Clip,
+    QueryOf(query): QueryOf<WindowQuery>,
     method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
@@ -40,8 +53,9 @@ pub(in crate::http) async fn movie(
     }
     // Of what is not there no movie can be made.
     clip.pieces().await?;
+    let window = display_window(&clip, &query).await?;
     loop {
-        match clip.app.store.movie(&clip.job, clip.snapshot).await? {
+        match clip.app.store.movie(&clip.job, clip.snapshot, &window).await? {
             Movie::Ready { sha256, size } => {
                 let file = match clip.app.store.open_blob(sha256).await {
                     // Known to be damaged by now, it is made again.
@@ -61,6 +75,19 @@ pub(in crate::http) async fn movie(
             }
         }
     }
+}
+
+/// The requested values of black and white as the store keeps them; null for the job's white level.
+async fn display_window(clip: &Clip, query: &WindowQuery) -> Result<Value> {
+    if query.black.is_none() && query.white.is_none() {
+        return Ok(Value::Null);
+    }
+    let white = match query.white {
+        None => pictures::white_level(&clip.app, clip.job.id).await?,
+        white => white,
+    };
+    let (black, white) = pictures::window(query.black.unwrap_or(0.0), white.unwrap_or(1.0))?;
+    serde_json::to_value(DisplayWindow { black, white }).map_err(|error| ApiError::internal(&error))
 }
 
 fn asked(fraction: Option<f64>) -> Response {

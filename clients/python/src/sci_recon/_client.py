@@ -373,8 +373,12 @@ class Job(Entity):
     def verdict(self) -> str:
         """The grade of the frames, with the expected PSNR where it can be predicted."""
         if assessment := self.record.get("assessment"):
-            psnr, low, high = (assessment[key] for key in ("psnr_db", "psnr_low_db", "psnr_high_db"))
-            return f"{assessment['grade']}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
+            grade, psnr, low, high = (assessment[key] for key in ("grade", "psnr_db", "psnr_low_db", "psnr_high_db"))
+            if psnr is None:
+                return f"{grade}, no expected PSNR"
+            if psnr < 40:
+                return f"{grade}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
+            return f"{grade}, expected PSNR 40 dB or more" + (f" ({low:.1f} or more)" if low < 40 else "")
         return "bad" if any(finding["severity"] == "error" for finding in self.findings) else "not assessed"
 
     @property
@@ -465,7 +469,7 @@ class Result:
     @property
     def assessment(self) -> Record | None:
         """How good the frames are expected to be: `grade`, `psnr_db` between `psnr_low_db` and `psnr_high_db`, and `reasons`;
-        None where nothing can be told."""
+        None where nothing can be predicted. The figures are None where a finding puts scale, dark or masks in doubt."""
         return self.job.record.get("assessment")
 
     def expected_error(self, index: int) -> npt.NDArray[np.float32]:

@@ -55,7 +55,10 @@ pub struct JobTask {
     pub prepared: Option<Value>,
     /// What its pilot recorded, if it has one that is done.
     pub pilot: Option<Value>,
-    /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan.
+    /// The record of its white level, once that is determined.
+    pub white: Option<Value>,
+    /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan. For the white level: all
+    /// tiles of the job, without their assessments.
     pub tiles: Vec<TileResult>,
     /// For the manifest: all other tasks of the job, in order.
     pub records: Vec<TaskRecord>,
@@ -85,8 +88,10 @@ pub struct MovieWork {
     pub job: JobId,
     pub spec: JobSpec,
     pub measurement: Measurement,
-    /// What the job's prepare task recorded.
-    pub prepared: Option<Value>,
+    /// The record of the job's white level.
+    pub white: Option<Value>,
+    /// The values to show as black and as white, if they were requested.
+    pub window: Option<Value>,
     /// Of each snapshot the array with its frames, and the hash that it should have.
     pub arrays: Vec<(PathBuf, Sha256)>,
 }
@@ -271,22 +276,25 @@ impl Store {
         let facts = sql_as!(
             "SELECT spec,
                  (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
-                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot,
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'white') AS white
              FROM jobs WHERE id = ?",
             [job]
         );
         type Record = Option<Json<Value>>;
-        let (Json(spec), prepared, pilot): (Json<JobSpec>, Record, Record) =
+        let (Json(spec), prepared, pilot, white): (Json<JobSpec>, Record, Record, Record) =
             facts.fetch_one(&self.readers).await?;
         let calibration = self.find_calibration(None, spec.calibration).await?;
         let measurement = self.find_measurement(None, spec.measurement).await?;
         let (mut tiles, mut records) = (Vec::new(), Vec::new());
         match kind {
             TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
+            TaskKind::White => tiles = self.all_tile_results(job).await?,
             TaskKind::Manifest => records = self.task_records(job).await?,
             _ => {}
         }
-        let (prepared, pilot) = (prepared.map(|json| json.0), pilot.map(|json| json.0));
+        let [prepared, pilot, white] =
+            [prepared, pilot, white].map(|record| record.map(|json| json.0));
         Ok(Work::Job(Box::new(JobTask {
             job,
             spec,
@@ -294,6 +302,7 @@ impl Store {
             measurement,
             prepared,
             pilot,
+            white,
             tiles,
             records,
         })))
@@ -302,10 +311,11 @@ impl Store {
     async fn movie_work(&self, job: JobId, snapshot: Option<u32>) -> Result<Work> {
         let job = self.job_of_any_lab(job).await?;
         let measurement = self.find_measurement(None, job.spec.measurement).await?;
-        let prepared: Option<Json<Value>> =
-            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'prepare'", [job.id])
+        let white: Option<Json<Value>> =
+            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job.id])
                 .fetch_one(&self.readers)
                 .await?;
+        let window = self.movie_window(job.id, snapshot).await?;
         let mut arrays = Vec::new();
         for snapshot in
             snapshot.map_or_else(|| job.spec.snapshots.indices().collect(), |one| vec![one])
@@ -313,8 +323,8 @@ impl Store {
             let (file, path) = self.result_file(&job, Some(snapshot), "frames.npy").await?;
             arrays.push((path, file.sha256));
         }
-        let prepared = prepared.map(|json| json.0);
-        let work = MovieWork { job: job.id, spec: job.spec, measurement, prepared, arrays };
+        let white = white.map(|json| json.0);
+        let work = MovieWork { job: job.id, spec: job.spec, measurement, white, window, arrays };
         Ok(Work::Movie(Box::new(work)))
     }
 

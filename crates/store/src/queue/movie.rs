@@ -1,9 +1,10 @@
 //! Movies of results: asked for, made by a worker when nothing else is to be done, and kept with their job.
 
+use serde_json::Value;
 use sqlx::SqliteConnection;
 
 use super::graph;
-use crate::columns::{Columns, sql, sql_as};
+use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::quota;
 use crate::tables::results::WHOLE_JOB;
@@ -25,12 +26,14 @@ pub enum Movie {
 
 impl Store {
     /// Finds the movie of a snapshot of a job (or, with none, of all), or asks for it if nobody has, or if it is
-    /// damaged. The frames must be there.
+    /// damaged. The frames must be there. A movie of another display window is replaced; `window` is null for the job's
+    /// white level.
     /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if the job is gone.
-    pub async fn movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
+    pub async fn movie(&self, job: &Job, snapshot: Option<u32>, window: &Value) -> Result<Movie> {
         let place = place(snapshot);
         let found = sql!(FIND, [job.id, place]).fetch_optional(&self.readers).await?;
         if let Some(row) = found
+            && row.read_json::<Value>("record")?.unwrap_or_default() == *window
             && let state @ (TaskState::Ready | TaskState::Running | TaskState::Done) =
                 row.read("state")?
         {
@@ -44,17 +47,18 @@ impl Store {
                 (_, None) => return Ok(Movie::Asked(None)),
             }
         }
-        self.ask_movie(job, snapshot).await
+        self.ask_movie(job, snapshot, window).await
     }
 
     /// Asks for a movie anew, or tells why the last one failed.
-    async fn ask_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
+    async fn ask_movie(&self, job: &Job, snapshot: Option<u32>, window: &Value) -> Result<Movie> {
         let place = place(snapshot);
         let mut transaction = self.write().await?;
         let failed: Option<Option<String>> = sql_as!(
             "SELECT (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt)
-             FROM tasks WHERE thing = ? AND coalesce(snapshot, -1) = ? AND state = ?",
-            [job.id, place, TaskState::Failed]
+             FROM tasks WHERE thing = ? AND coalesce(snapshot, -1) = ? AND state = ?
+                 AND coalesce(record, 'null') = ?",
+            [job.id, place, TaskState::Failed, Json(window)]
         )
         .fetch_optional(&mut *transaction)
         .await?;
@@ -69,8 +73,25 @@ impl Store {
         known.ok_or_else(|| StoreError::missing("job", job.id))?;
         let (kind, cost) = (TaskKind::Movie { snapshot }, job.spec.movie_cost(snapshot));
         graph::insert_for(&mut transaction, (&job.lab, job.id.into()), kind, cost).await?;
+        sql!(
+            "UPDATE tasks SET record = ? WHERE thing = ? AND coalesce(snapshot, -1) = ?",
+            [Json(window), job.id, place]
+        )
+        .execute(&mut *transaction)
+        .await?;
         transaction.commit().await?;
         Ok(Movie::Asked(None))
+    }
+
+    /// The values to show as black and as white in a movie; `None` for the job's white level.
+    pub(super) async fn movie_window(
+        &self,
+        job: JobId,
+        snapshot: Option<u32>,
+    ) -> Result<Option<Value>> {
+        let found = sql!(FIND, [job, place(snapshot)]).fetch_optional(&self.readers).await?;
+        let window = found.map(|row| row.read_json::<Value>("record")).transpose()?.flatten();
+        Ok(window.filter(|window| !window.is_null()))
     }
 
     /// Removes the movies of a job, or that of one snapshot of it, with the tasks that make them.
@@ -95,7 +116,7 @@ impl Store {
 }
 
 /// A damaged one is as good as none.
-const FIND: &str = "SELECT state, fraction, result, size FROM tasks
+const FIND: &str = "SELECT state, fraction, result, size, record FROM tasks
     LEFT JOIN blobs ON sha256 = result AND damaged_at IS NULL
     WHERE thing = ? AND coalesce(snapshot, -1) = ?";
 

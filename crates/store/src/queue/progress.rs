@@ -234,8 +234,8 @@ impl Store {
         let row = sql!(
             "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
                     / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
-                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
-                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
+                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'white', 'assemble'))
+                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'white', 'assemble')) AS others
              FROM totals",
         )
         .fetch_one(&self.readers)

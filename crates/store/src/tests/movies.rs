@@ -23,17 +23,23 @@ async fn a_movie_is_made_when_nothing_else_is_to_be_done() {
     let lab = Lab::new().await;
     let job = lab.done().await;
     for _ in 0..2 {
-        assert_eq!(lab.store.movie(&job, Some(1)).await.unwrap(), Movie::Asked(None));
+        assert_eq!(
+            lab.store.movie(&job, Some(1), &serde_json::Value::Null).await.unwrap(),
+            Movie::Asked(None)
+        );
     }
-    assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(None));
+    assert_eq!(
+        lab.store.movie(&job, None, &serde_json::Value::Null).await.unwrap(),
+        Movie::Asked(None)
+    );
     let other = lab.submit(-100).await;
     let done = lab.work_off().await;
     let movies = [TaskKind::Movie { snapshot: Some(1) }, TaskKind::Movie { snapshot: None }];
     assert_eq!(done[done.len() - 3], TaskKind::Manifest, "{done:?}");
     assert!(movies.iter().all(|movie| done[done.len() - 2..].contains(movie)), "{done:?}");
     lab.job(other).await;
-    let one = lab.store.movie(&job, Some(1)).await.unwrap();
-    let all = lab.store.movie(&job, None).await.unwrap();
+    let one = lab.store.movie(&job, Some(1), &serde_json::Value::Null).await.unwrap();
+    let all = lab.store.movie(&job, None, &serde_json::Value::Null).await.unwrap();
     let (Movie::Ready { sha256: one, .. }, Movie::Ready { sha256: all, size: 10 }) = (one, all)
     else {
         panic!()
@@ -47,15 +53,24 @@ async fn a_movie_is_made_when_nothing_else_is_to_be_done() {
 async fn a_movie_that_fails_fails_nothing_else() {
     let lab = Lab::new().await;
     let job = lab.done().await;
-    lab.store.movie(&job, None).await.unwrap();
+    lab.store.movie(&job, None, &serde_json::Value::Null).await.unwrap();
     let task = lab.claim().await.unwrap();
     assert_eq!(task.kind, TaskKind::Movie { snapshot: None });
-    assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(Some(0.0)));
+    assert_eq!(
+        lab.store.movie(&job, None, &serde_json::Value::Null).await.unwrap(),
+        Movie::Asked(Some(0.0))
+    );
     lab.store.fail(&task.lease, "no codec", false).await.unwrap();
     lab.job(job.id).await;
     // It is told once, and then tried again.
-    assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Failed("no codec".into()));
-    assert_eq!(lab.store.movie(&job, None).await.unwrap(), Movie::Asked(None));
+    assert_eq!(
+        lab.store.movie(&job, None, &serde_json::Value::Null).await.unwrap(),
+        Movie::Failed("no codec".into())
+    );
+    assert_eq!(
+        lab.store.movie(&job, None, &serde_json::Value::Null).await.unwrap(),
+        Movie::Asked(None)
+    );
 
     // A job may go while a worker is at its movie: here the one that leaves tiles to other machines.
     let claimant = Claimant::WithoutTiles;
