@@ -59,7 +59,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let file = file.map_err(FormatError::io("write masks.npy"))?;
         npy::writer(BufWriter::new(file), (info.frames, info.height, info.width), Channels::Grey)
     };
-    let made = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share);
+    let made = calibrate((&files, None), &Limits::default(), scratch.path(), masks, &mut share);
     let (made, _) = made.map_err(|error| match error.is_retryable() {
         // Of what is written, too.
         true => CliError::Failure(error.to_string()),

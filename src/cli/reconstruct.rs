@@ -18,8 +18,12 @@ use super::output::print_line;
 use super::progress::SnapshotBar;
 use super::verdict;
 use crate::cli::error::Result;
-use engine::intake::{self, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth};
-use engine::job::{Algorithm, Assessment, Finding, Mosaic, SceneShape, Schedule, Sequence, Sha256};
+use engine::intake::{
+    self, Behind, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth,
+};
+use engine::job::{
+    Algorithm, Assessment, Finding, MaskOrder, Mosaic, SceneShape, Schedule, Sequence, Sha256,
+};
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
@@ -61,7 +65,10 @@ pub struct Arguments {
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE")]
     dark: Vec<PathBuf>,
-    /// The stored number from which on a pixel is saturated [default: the largest of its type].
+    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
+    #[arg(long, value_name = "FILE")]
+    bad_pixels: Option<PathBuf>,
+    /// The stored number from which on a pixel is saturated [default: the largest one, if pixels pile up there].
     #[arg(long, value_name = "NUMBER")]
     saturation: Option<u32>,
     /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
@@ -295,7 +302,7 @@ struct Input<'a> {
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let mut sources = Sources::new(arguments)?;
-        let masks = read_masks(&sources.masks)?;
+        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
         if let Some(truth) = &mut sources.truth {
@@ -304,7 +311,10 @@ impl<'a> Input<'a> {
         let Snapshots { first, last } = arguments.snapshots;
         let Arguments { dark, saturation, .. } = arguments;
         let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
-        let read = read_snapshots(&sources.measurement, &exposure, (first, last))?;
+        let behind =
+            Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
+        masks.array.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
+        let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))?;
         let (measurement, snapshots) = (read.measurement, read.count);
         let (count, rows, columns) = measurement.array.dim();
         if (rows, columns) != (height, width) {
@@ -331,13 +341,13 @@ impl<'a> Input<'a> {
         };
         let darkened = !dark.is_empty();
         let both = (masks.array.view(), measurement.array.view());
-        let mut findings = read.passed.findings;
-        let judged = judge(both, mosaic, read.passed.saturated.as_deref(), darkened)?;
-        findings.extend(judged.into_iter().map(|finding| {
+        let judged = judge(both, mosaic, darkened)?;
+        let judged = judged.into_iter().map(|finding| {
             // Counted from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
             Finding { snapshot, ..finding }
-        }));
+        });
+        let findings = intake::combined(read.passed.findings, judged.collect());
         Ok(Self { sources, masks, measurement, first, truth, mosaic, findings })
     }
 
@@ -398,13 +408,12 @@ impl<'a> Input<'a> {
 fn judge(
     (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
     mosaic: Option<Mosaic>,
-    saturated: Option<&[f64]>,
     darkened: bool,
 ) -> Result<Vec<Finding>> {
     let limits = Limits::default();
     let prepared = [prepare(masks)?, prepare(snapshots)?];
     let both = (prepared[0].path(), prepared[1].path());
-    let mut findings = intake::judge(both, mosaic, saturated, darkened, &limits)?;
+    let mut findings = intake::judge(both, mosaic, darkened, &limits)?;
     let report = intake::report(&planar::Reader::open(both.0, &limits)?, &mut |_| true)?;
     findings.extend(report.report.warning());
     Ok(findings)
@@ -538,6 +547,9 @@ impl Report {
             self.stop_reason
         ))?;
         print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
+        if self.assessment.as_ref().and_then(|one| one.order) == Some(MaskOrder::NotVerifiable) {
+            print_line("order of masks not verifiable: the scene moves too little or too fast")?;
+        }
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(

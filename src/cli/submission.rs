@@ -37,6 +37,9 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
           help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
+    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
+    #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
+    bad_pixels: Option<PathBuf>,
     /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas].
     #[arg(long, value_name = "NAME", help_heading = MEASUREMENT)]
     array: Option<String>,
@@ -46,7 +49,8 @@ pub(super) struct SubmissionArguments {
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE", help_heading = MEASUREMENT)]
     dark: Vec<PathBuf>,
-    /// The stored number from which on a pixel is saturated [default: the largest of its type].
+    /// The stored number from which on a pixel is saturated [default: the largest one, if pixels
+    /// pile up there].
     #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
     saturation: Option<u32>,
     /// The stored number in the snapshots that means 1 [default: that of their type].
@@ -104,9 +108,9 @@ pub(super) struct Recipe {
 }
 
 impl SubmissionArguments {
-    /// Files that belong to each snapshot: the masks and the dark captures.
+    /// Files that belong to each snapshot: the masks, the map of bad pixels and the dark captures.
     pub(super) fn own_files(&self) -> impl Iterator<Item = &PathBuf> {
-        self.masks.iter().chain(&self.dark)
+        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark)
     }
 
     /// Uploads masks and dark captures, makes the calibration if need be, and returns what to request.
@@ -115,7 +119,11 @@ impl SubmissionArguments {
         let calibration = match (&self.calibration, &self.masks) {
             (Some(id), _) => id.to_string(),
             (None, Some(masks)) => {
-                let body = self.calibration_request(client.sent(masks).await?);
+                let bad_pixels = match &self.bad_pixels {
+                    Some(map) => Some(client.sent(map).await?),
+                    None => None,
+                };
+                let body = self.calibration_request(client.sent(masks).await?, bad_pixels);
                 // One file of masks makes one calibration for all clients.
                 let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
                 client.made("/v1/calibrations", &body, &key).await?
@@ -139,12 +147,13 @@ impl SubmissionArguments {
         Ok(sent)
     }
 
-    fn calibration_request(&self, masks: Sha256) -> Value {
+    fn calibration_request(&self, masks: Sha256, bad_pixels: Option<Sha256>) -> Value {
         let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
         add(&mut body, "array", json!(self.masks_array));
         add(&mut body, "axes", json!(self.masks_axes));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         add(&mut body, "mosaic", json!(self.mosaic));
+        add(&mut body, "bad_pixels", json!(bad_pixels));
         add(&mut body, "name", json!(self.masks_name));
         Value::Object(body)
     }
@@ -262,6 +271,7 @@ mod tests {
             ("masks-full-scale", "255"),
             ("masks-name", "May"),
             ("mosaic", "rggb"),
+            ("bad-pixels", "b.npy"),
             ("array", "meas"),
             ("axes", "row-column-frame"),
             ("dark", "d.npy"),
@@ -293,7 +303,7 @@ mod tests {
         let arguments = SubmissionArguments::from_arg_matches(&matches).unwrap();
 
         let sha256 = Sha256::of(b"file");
-        let calibration = arguments.calibration_request(sha256);
+        let calibration = arguments.calibration_request(sha256, Some(sha256));
         // Captures of many files are for `calibrate`, the dashboard and the client libraries.
         let expected = properties("CalibrationRequest", &["captures"]);
         assert_eq!(names(calibration.as_object().unwrap()), expected);

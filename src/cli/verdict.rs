@@ -162,6 +162,7 @@ mod tests {
             psnr_db: Some(31.24),
             psnr_low_db: Some(29.8),
             psnr_high_db: Some(32.9),
+            order: None,
             reasons: Vec::new(),
         };
         let text = verdict(Some(&assessment), &[]);

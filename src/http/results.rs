@@ -13,6 +13,7 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use super::jobs::with_snapshot;
 use engine::job::{JobId, JobState, ResultFile};
+use engine::pipeline::records::WhiteRecord;
 use store::{Job, StoreError};
 
 #[derive(Debug, Serialize)]
@@ -180,6 +181,14 @@ pub(super) fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String
         Some(snapshot) => format!("filename=\"{short}_{snapshot:04}_{file}\""),
         None => format!("filename=\"{short}_{file}\""),
     }
+}
+
+/// The white level of a job's frames; `None` before it is determined.
+pub(in crate::http) async fn white_level(app: &App, job: JobId) -> Result<Option<f32>> {
+    let record = app.store.white_record(job).await?;
+    let read = |record| serde_json::from_value::<WhiteRecord>(record);
+    let record = record.map(read).transpose().map_err(|error| ApiError::internal(&error))?;
+    Ok(record.map(|record| record.white_level))
 }
 
 #[cfg(test)]

@@ -10,7 +10,9 @@ use crate::samples::Scene;
 #[tokio::test]
 async fn a_result_has_an_expected_psnr_and_an_error_map() {
     let app = TestApp::with(&["--workers", "1"]).await;
-    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // Of fewer masks too many pixels are closed, which puts the calibration in doubt.
+    let scene = Scene { frames: 10, ..Scene::SMALL };
+    let (_, measurement) = app.scene(&scene).await;
     // Two tiles, so that their error maps are joined.
     let wanted = json!({"measurement": measurement, "algorithm": "gap-tv", "tile": {"size": 32, "overlap": 8}});
     let job = app.submit(&wanted).await;
@@ -38,7 +40,7 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
     let base = format!("/v1/jobs/{job}/snapshots/0");
     let manifest = app.get(&format!("{base}/manifest.json")).await.expect(200).json();
     assert_eq!(manifest["content"]["assessment"], snapshots[0]["assessment"]);
-    let Scene { frames, height, width, .. } = Scene::SMALL;
+    let Scene { frames, height, width, .. } = scene;
     let blocks = (height.div_ceil(16), width.div_ceil(16));
     let array = app.get(&format!("{base}/error.npy")).await.expect(200).bytes;
     let header = String::from_utf8_lossy(&array[..128]).into_owned();

@@ -71,7 +71,7 @@ fn saturated_pixels_are_found_at_any_depth_and_left_out() {
     let clip = sorted[PIXELS * 87 / 100];
     let (clipped, found) = reconstruct(&masks, float(y.iter().map(|y| y.min(clip))), &TV);
     assert_eq!(codes(&clipped["findings"])[0], "saturated", "{clipped:#}");
-    assert!(found > whole - 3.0, "{found} dB, {whole} dB without saturation");
+    assert!(found > whole - 5.5, "{found} dB, {whole} dB without saturation");
     // 12 bits in 16, with a full scale that is not the limit of the sensor.
     let mut file = npy_header("<u2", &[64, 96]);
     let stored = y.iter().map(|y| (y / clip * 4095.0).min(4095.0).round() as u16);
@@ -79,10 +79,11 @@ fn saturated_pixels_are_found_at_any_depth_and_left_out() {
     let scale = (4095.0 / clip).to_string();
     let more = [&TV[..], &["--measurement-full-scale", &scale]].concat();
     let (camera, found) = reconstruct(&masks, file, &more);
-    let first = camera["findings"].as_array().unwrap().iter().find(|one| one["code"] == "saturated");
+    let first =
+        camera["findings"].as_array().unwrap().iter().find(|one| one["code"] == "saturated");
     let detail = first.unwrap()["detail"].as_str().unwrap();
     assert!(detail.contains("4095") && detail.contains("13."), "{detail}");
-    assert!(found > whole - 3.0, "{found} dB, {whole} dB without saturation");
+    assert!(found > whole - 5.5, "{found} dB, {whole} dB without saturation");
 }
 
 #[test]

@@ -24,6 +24,7 @@ mod crashes;
 mod damage;
 mod dashboard;
 mod deep;
+mod defects;
 mod downloads;
 mod exports;
 mod faults;

@@ -2,6 +2,8 @@
 
 use ndarray::{Array2, ArrayView2};
 
+use super::{Finding, FindingCode};
+
 /// Smallest number of pixels at the largest value that counts as a pile-up.
 const MIN_PILE_UP: usize = 8;
 /// A pile-up has this many times the pixels of the other values near the largest one. Simulated snapshots of 2 to 16
@@ -9,7 +11,7 @@ const MIN_PILE_UP: usize = 8;
 const PILE_UP_RATIO: f64 = 4.0;
 /// Values above this share of the largest one are compared with it.
 const NEAR_LARGEST: f32 = 0.9;
-/// Where only pixels with all masks open reach the largest value, the scene is white there. This share of them may differ.
+/// A white scene reaches the largest value where all masks are open. This share of the pixels may differ.
 const MAX_DIFFERENT: f64 = 0.05;
 
 /// Value from which on the pixels of a snapshot are saturated, if they are: `stated`, or the largest value if pixels pile
@@ -26,9 +28,10 @@ pub fn saturation(
     }
     let finite = values.iter().zip(&light).filter(|(value, _)| value.is_finite());
     let largest = finite.clone().map(|(value, _)| *value).fold(f32::NEG_INFINITY, f32::max);
-    let (brightest, smallest) = finite.clone().fold((0f32, f32::INFINITY), |(light, least), (value, l)| {
-        (light.max(*l), least.min(*value))
-    });
+    let (brightest, smallest) =
+        finite.clone().fold((0f32, f32::INFINITY), |(light, least), (value, l)| {
+            (light.max(*l), least.min(*value))
+        });
     if largest <= 0.0 || smallest == largest {
         return None;
     }
@@ -88,21 +91,22 @@ pub fn outliers(
         return Vec::new();
     }
     let (excess, deficit) = (MIN_EXCESS * bright, MIN_DEFICIT * bright);
-    let near = |at: usize, length: usize| {
+    let neighbours = |at: usize, length: usize| {
         let first = at - step * (at / step).min(REACH);
         (first..length.min(at + step * REACH + 1)).step_by(step)
     };
     let is_outlier = |&((row, column), &value): &((usize, usize), &f32)| {
         let own = light[[row, column]];
         // Most pixels need no look at their neighbours.
-        let may_be_dark = own > MUCH_LIGHT * mean_light && value < TOO_DARK * own / mean_light * bright;
+        let may_be_dark =
+            own > MUCH_LIGHT * mean_light && value < TOO_DARK * own / mean_light * bright;
         if !value.is_finite() || !(value > excess || may_be_dark) {
             return false;
         }
         let (mut values, mut ratios) = ([f32::NEG_INFINITY; FEW + 1], [f32::NEG_INFINITY; FEW + 1]);
         let mut darkest = [f32::INFINITY; FEW];
-        for row_near in near(row, height) {
-            for column_near in near(column, width) {
+        for row_near in neighbours(row, height) {
+            for column_near in neighbours(column, width) {
                 let (near, light) = (y[[row_near, column_near]], light[[row_near, column_near]]);
                 if (row_near, column_near) == (row, column) || !near.is_finite() {
                     continue;
@@ -171,13 +175,50 @@ impl Defects {
         }
         found.level = saturation(values.view(), light, stated);
         if let Some(level) = found.level {
-            for value in values.iter_mut().filter(|value| **value >= level) {
-                *value = f32::NAN;
-                found.saturated += 1;
+            found.saturated = values.iter().filter(|value| **value >= level).count();
+            // Without nearly all pixels there is nothing to reconstruct from.
+            if found.saturated * 10 <= values.len() * 9 {
+                values.mapv_inplace(|value| if value >= level { f32::NAN } else { value });
             }
         }
         found
     }
+}
+
+/// Share of saturated pixels from which there is a finding, and from which frames are wrong.
+const REPORTED_SHARE: f64 = 0.001;
+const GRAVE_SHARE: f64 = 0.2;
+
+/// Reports the defects of a snapshot of `pixels` pixels.
+#[allow(clippy::cast_precision_loss)] // counts of pixels
+pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
+    const LEFT_OUT: &str = "They are left out of the reconstruction";
+    let share = |count: usize| count as f64 / pixels.max(1) as f64;
+    let mut findings = Vec::new();
+    let Defects { missing, outliers, saturated, level } = *defects;
+    if let (Some(level), true) = (level, share(saturated) > REPORTED_SHARE) {
+        let detail = format!(
+            "{:.2} % of the pixels are at {level} or above, the limit of the sensor: they were saturated. {LEFT_OUT}",
+            100.0 * share(saturated)
+        );
+        let finding = Finding::new(FindingCode::Saturated, detail);
+        findings.push(finding.escalate_if(share(saturated) > GRAVE_SHARE));
+    }
+    if missing + outliers > 0 {
+        let mut parts = Vec::new();
+        if outliers > 0 {
+            parts.push(format!(
+                "{outliers} pixels are far brighter or darker than their neighbours and their masks allow"
+            ));
+        }
+        if missing > 0 {
+            parts.push(format!("{missing} pixels are marked as not measured"));
+        }
+        let detail = format!("{}. {LEFT_OUT}", parts.join(", and "));
+        let grave = share(missing + outliers) > GRAVE_SHARE;
+        findings.push(Finding::new(FindingCode::BadPixels, detail).escalate_if(grave));
+    }
+    findings
 }
 
 #[cfg(test)]
@@ -233,14 +274,18 @@ mod tests {
                     let expected = clipped.iter().copied().fold(0.0, f32::max);
                     let count = clipped.iter().filter(|value| **value == expected).count();
                     let found = Defects::mark(&mut clipped, None, light.view(), (1, None));
-                    assert_eq!((found.level, found.saturated), (Some(expected), count), "{found:?}");
+                    assert_eq!(
+                        (found.level, found.saturated),
+                        (Some(expected), count),
+                        "{found:?}"
+                    );
                     assert_eq!(clipped.iter().filter(|value| value.is_nan()).count(), count);
                 }
             }
         }
     }
 
-    /// Where the scene is white, independent masks that are all open reach the same largest value.
+    /// A white scene reaches the same largest value at all pixels behind open masks.
     #[test]
     fn a_white_scene_is_not_saturated() {
         let masks = iid_masks(4, 96, 96, 3).unwrap();

@@ -57,6 +57,8 @@ pub enum FindingCode {
     LightDrift,
     BadCalibration,
     Saturated,
+    BadPixels,
+    EmptySnapshot,
     LeftAligned,
     RightAligned,
     Level,
@@ -66,11 +68,14 @@ pub enum FindingCode {
     NegativeOffset,
     Mosaic,
     ShiftedMasks,
+    DriftedMasks,
+    TurnedMasks,
     ForeignMasks,
     FastMotion,
     UnfamiliarMasks,
     UnevenError,
     UnexplainedPixels,
+    ExchangedMasks,
 }
 
 /// The description of a [`FindingCode`].
@@ -239,7 +244,21 @@ impl FindingCode {
                 Warning,
                 Error,
                 "pixels are saturated",
-                "reduce the exposure time or stop down the lens",
+                "reduce the exposure time or stop down the lens; if the value is a valid reading, state a higher `saturation`",
+            ),
+            Self::BadPixels => (
+                &[Measurement],
+                Warning,
+                Error,
+                "pixels are hot, dead, or marked as not measured",
+                "nothing, if there are few; name a map of the sensor's bad pixels as `bad_pixels` of the calibration",
+            ),
+            Self::EmptySnapshot => (
+                &[Measurement],
+                Warning,
+                Warning,
+                "a snapshot is 0 everywhere",
+                "check the trigger of the camera; the frames of this snapshot are black",
             ),
             Self::LeftAligned => (
                 &[Measurement],
@@ -306,6 +325,21 @@ impl FindingCode {
                 "the masks fit better when shifted (by up to 4 pixels)",
                 "the optics moved since the calibration: calibrate again",
             ),
+            Self::DriftedMasks => (
+                &[Measurement],
+                Warning,
+                Warning,
+                "the masks are displaced by a fraction of a pixel",
+                "calibrate again once the optics are stable; if the finding stays, record dark frames and name them as `dark`",
+            ),
+            Self::TurnedMasks => (
+                &[Measurement],
+                Error,
+                Error,
+                "the masks fit when they are flipped or their rows and columns exchanged",
+                "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
+                 calibration again",
+            ),
             Self::ForeignMasks => (
                 &[Measurement],
                 Error,
@@ -333,6 +367,13 @@ impl FindingCode {
                 Warning,
                 "a part of the picture is expected to be much worse than the rest",
                 "look at the map of the expected error before relying on this part",
+            ),
+            Self::ExchangedMasks => (
+                &[Result],
+                Error,
+                Error,
+                "two masks are probably exchanged",
+                "check that the masks are in the order in which the LCoS shows the patterns during a measurement",
             ),
             Self::UnexplainedPixels => (
                 &[Result],

@@ -19,6 +19,7 @@ use super::error::{ReconError, Result, shape_text};
 use super::hold_out::Prediction;
 use super::motion::Steps;
 use super::operator::SensingOperator;
+use super::order::Order;
 pub use super::priors::BLOCK;
 use super::priors::nonlocal::NonlocalSpec;
 use super::priors::registry::PriorSpec;
@@ -369,9 +370,12 @@ pub struct Evidence {
     pub signs: Signs,
     /// Values of [`FEATURES`], means over the blocks of the crop.
     pub features: Vec<f32>,
-    /// How much better than without masks the frames predict the hold-out pixels.
+    /// Prediction of the hold-out pixels by the frames, and without masks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<Prediction>,
+    /// The order of the frames after the first stage, if its prior has no link along time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub order: Option<Order>,
     /// Evidence of the first run of a stage that is run twice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub first: Option<Box<Evidence>>,
@@ -382,7 +386,7 @@ impl Evidence {
     pub(super) fn new(signs: Signs, features: &Array4<f32>) -> Self {
         let mean = |values: ArrayView3<'_, f32>| values.mean().unwrap_or(0.0);
         let features = features.outer_iter().map(mean).collect();
-        Self { signs, features, prediction: None, first: None }
+        Self { signs, features, prediction: None, order: None, first: None }
     }
 }
 
@@ -800,7 +804,7 @@ mod tests {
         let alone = strong.log_errors(&result, None);
         let distant = with(&(ramp() + 1.0));
         assert_eq!(strong.log_errors(&distant, None), alone, "large distance: a static scene");
-        let moving = strong.log_errors(&with(&(ramp() + 1e-3)), None, 1.0);
+        let moving = strong.log_errors(&with(&(ramp() + 1e-3)), None);
         let of_first_run = weak.log_errors(&first, None);
         let difference =
             (&moving - &of_first_run).iter().fold(0.0, |largest: f32, d| largest.max(d.abs()));

@@ -7,6 +7,7 @@ use super::crop;
 use super::error::{ReconError, Result};
 use super::hold_out::HoldOut;
 use super::operator::SensingOperator;
+use super::order::Order;
 use super::priors::Networks;
 use super::schedule::Schedule;
 use super::signs::Signs;
@@ -70,8 +71,15 @@ impl HeldOutMeasurement<'_> {
     ) -> Option<Evidence> {
         let (early, last) = (early.view(), last.view());
         let signs = Signs::of((self.op, self.y), self.hold_out, early, last)?;
+        let first_stage = early;
         let early = (schedule.stages.len() > 1).then_some(early);
         let prediction = Some(self.hold_out.prediction(self.op, self.y, last));
-        Some(Evidence { prediction, ..Evidence::new(signs, &features(self.whole, early, last)) })
+        let is_frame_by_frame = schedule
+            .stages
+            .first()
+            .is_some_and(|stage| stage.prior.tv().is_some_and(|tv| tv.temporal_weight == 0.0));
+        let order = if is_frame_by_frame { Order::of(first_stage) } else { None };
+        let evidence = Evidence::new(signs, &features(self.whole, early, last));
+        Some(Evidence { prediction, order, ..evidence })
     }
 }

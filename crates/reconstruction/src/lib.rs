@@ -23,6 +23,7 @@ pub mod learned;
 pub mod metrics;
 pub mod motion;
 pub mod operator;
+pub mod order;
 pub mod pilot;
 pub mod preview;
 pub mod priors;

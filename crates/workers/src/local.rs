@@ -62,6 +62,7 @@ impl Local {
             Work::Calibration(task) => match &task.captures {
                 Some(captures) => Ok(TaskInput::Captures {
                     files: captures.map(|upload| self.path(*upload)),
+                    bad_pixels: task.bad_pixels.map(|map| self.path(map)),
                     scratch: self.store.staged_path().map_err(failed)?,
                     masks: Box::new(self.store.blob_writer().map_err(failed)?),
                 }),

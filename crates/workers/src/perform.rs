@@ -122,13 +122,13 @@ pub(super) fn perform(
             let checked = check(&task, engines.models.command(), monitor)?;
             (Value::Null, Output::Checked(Box::new(checked)))
         }
-        TaskInput::Captures { files, scratch, masks } => {
+        TaskInput::Captures { files, bad_pixels, scratch, masks } => {
             let open =
                 |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
             let limits = Limits::default();
-            let (made, masks) = calibrate(&files, &limits, scratch.path(), open, &mut |share| {
-                tell(share, monitor)
-            })?;
+            let files = (&files, bad_pixels.as_deref());
+            let (made, masks) =
+                calibrate(files, &limits, scratch.path(), open, &mut |share| tell(share, monitor))?;
             let masks = masks.finish().map_err(TransportError::from)?;
             let facts = facts(&made, masks.sha256());
             (Value::Null, calibration(Some((facts, masks)), made.report, monitor))

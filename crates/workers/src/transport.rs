@@ -154,6 +154,8 @@ pub enum TaskInput {
     /// Make masks of captures, and a report on them; they lie in `scratch` until their scale is known.
     Captures {
         files: CaptureFiles,
+        /// A map of bad pixels.
+        bad_pixels: Option<PathBuf>,
         scratch: StagedPath,
         masks: Box<BlobWriter>,
     },

@@ -11,7 +11,7 @@ use super::super::download::Download;
 use super::super::error::{ApiError, Code, Result};
 use super::super::extract::QueryOf;
 use super::super::pictures;
-use super::super::results::{file_name, media_type};
+use super::super::results::{file_name, media_type, white_level};
 use super::clip::Clip;
 use engine::job::MIN_MOVIE_SIDE;
 use engine::pipeline::movie::DisplayWindow;
@@ -83,7 +83,7 @@ async fn display_window(clip: &Clip, query: &WindowQuery) -> Result<Value> {
         return Ok(Value::Null);
     }
     let white = match query.white {
-        None => pictures::white_level(&clip.app, clip.job.id).await?,
+        None => white_level(&clip.app, clip.job.id).await?,
         white => white,
     };
     let (black, white) = pictures::window(query.black.unwrap_or(0.0), white.unwrap_or(1.0))?;

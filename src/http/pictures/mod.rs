@@ -11,7 +11,6 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use names::Named;
-pub(super) use names::white_level;
 pub(super) use names::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 
 use super::app::App;

@@ -11,9 +11,9 @@ use crate::http::error::{ApiError, Code, Result};
 use crate::http::intake;
 use crate::http::jobs::with_snapshot;
 use crate::http::rendering::Picture;
-use crate::http::results::result_file;
+use crate::http::results::{result_file, white_level};
 use engine::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
-use engine::pipeline::records::{TileTaskRecord, WhiteRecord};
+use engine::pipeline::records::TileTaskRecord;
 use formats;
 use store::{Calibration, Job, Measurement, StoreError, TileResult};
 
@@ -281,14 +281,6 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let identity = Sha256::of(hashes.as_bytes()).to_string();
     let files = Files::Tiles(Arc::new(unfinished));
     Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic, white: None })
-}
-
-/// The white level of a job's frames; `None` before it is determined.
-pub(in crate::http) async fn white_level(app: &App, job: JobId) -> Result<Option<f32>> {
-    let record = app.store.white_record(job).await?;
-    let read = |record| serde_json::from_value::<WhiteRecord>(record);
-    let record = record.map(read).transpose().map_err(|error| ApiError::internal(&error))?;
-    Ok(record.map(|record| record.white_level))
 }
 
 /// The expected error of frame `k`, from 0.

@@ -165,6 +165,7 @@ mod tests {
             identity: "test".into(),
             settled: true,
             depth,
+            white: None,
             read: Box::new(move |rows, columns| Ok(values.slice(s![rows, columns]).to_owned())),
         }
     }

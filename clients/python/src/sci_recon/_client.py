@@ -78,6 +78,7 @@ class Client:
         masks_axes: str | None = None,
         masks_name: str | None = None,
         mosaic: str | None = None,
+        bad_pixels: Source | None = None,
         dark: Source | Sequence[Source] = (),
         saturation: int | None = None,
         full_scale: float | None = None,
@@ -110,7 +111,13 @@ class Client:
             calibration = masks
         else:
             calibration = self.calibrate(
-                masks, full_scale=masks_full_scale, array=masks_array, axes=masks_axes, mosaic=mosaic, name=masks_name
+                masks,
+                full_scale=masks_full_scale,
+                array=masks_array,
+                axes=masks_axes,
+                mosaic=mosaic,
+                bad_pixels=bad_pixels,
+                name=masks_name,
             )
         taken = self.measure(
             calibration,
@@ -150,13 +157,15 @@ class Client:
         array: str | None = None,
         axes: str | None = None,
         mosaic: str | None = None,
+        bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Makes a calibration of masks [B, H, W]; of a colour sensor with a `mosaic`.
 
-        `array` is their name in a file of several arrays.
+        `array` is their name in a file of several arrays. `bad_pixels` [H, W] is not 0 at bad pixels.
         """
         given: Record = {"full_scale": full_scale, "array": array, "axes": axes, "mosaic": mosaic, "name": name}
+        given["bad_pixels"] = None if bad_pixels is None else self.upload(bad_pixels)
         record = self._create("calibrations", masks=self.upload(masks), **given)
         return Calibration(self, record).ready()
 
@@ -170,6 +179,7 @@ class Client:
         patterns: Source | None = None,
         saturation: int | None = None,
         mosaic: str | None = None,
+        bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Makes a calibration of raw captures, and waits until its masks are there.
@@ -185,7 +195,9 @@ class Client:
         }
         if black_with_mask is not None:
             captures["black_with_mask"] = self._uploads(black_with_mask)
-        return Calibration(self, self._create("calibrations", captures=captures, mosaic=mosaic, name=name)).ready()
+        given: Record = {"mosaic": mosaic, "name": name}
+        given["bad_pixels"] = None if bad_pixels is None else self.upload(bad_pixels)
+        return Calibration(self, self._create("calibrations", captures=captures, **given)).ready()
 
     def measure(
         self,

@@ -9,14 +9,29 @@ use super::report::{Finding, Grade};
 pub struct Assessment {
     pub grade: Grade,
     /// Predicted PSNR in dB relative to the white level of the job's frames, mean over the frames. Values above 40 dB are
-    /// reported as 40 dB. `None`, like the interval, while a finding says that scale, dark or masks are in doubt.
+    /// reported as 40 dB. `None`, like the interval, while a finding questions scale, dark or masks.
     pub psnr_db: Option<f64>,
     /// Lower end of the interval that contains the true PSNR in four of five cases, in dB.
     pub psnr_low_db: Option<f64>,
     /// Upper end of that interval, in dB.
     pub psnr_high_db: Option<f64>,
+    /// Order of the masks, as far as the motion of the scene shows it; `None` without a test.
+    #[serde(default)]
+    pub order: Option<MaskOrder>,
     /// Findings that limit the quality or the reliability of the prediction.
     pub reasons: Vec<Finding>,
+}
+
+/// Evidence for the order of a snapshot's masks from its frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MaskOrder {
+    /// The frames follow one another more steadily than with any two masks exchanged. The reversed order looks the same.
+    Consistent,
+    /// The scene does not show the order.
+    NotVerifiable,
+    /// With two masks exchanged the frames would follow one another much more steadily.
+    Doubtful,
 }
 
 impl Assessment {
@@ -42,6 +57,7 @@ impl Assessment {
             psnr_db: mean(|one| one.psnr_db),
             psnr_low_db: mean(|one| one.psnr_low_db),
             psnr_high_db: mean(|one| one.psnr_high_db),
+            order: all.iter().filter_map(|one| one.order).max(),
             reasons,
         })
     }

@@ -4,11 +4,12 @@
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
-use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
+use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, Severity};
 pub use reconstruction::assessment::{BLOCK, blocks};
 use reconstruction::assessment::{Evidence, Model, unfamiliar_masks};
 use reconstruction::hold_out::Prediction;
 use reconstruction::motion::fastest;
+use reconstruction::order::Order;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::RunShare;
 use reconstruction::solver::Outcome;
@@ -32,6 +33,9 @@ pub struct TileAssessment {
     /// Prediction of the hold-out pixels, by this tile or by the pilot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     prediction: Option<Prediction>,
+    /// Order of the frames, by this tile or by the pilot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    order: Option<Order>,
 }
 
 /// Number of levels per decibel.
@@ -51,7 +55,14 @@ impl TileAssessment {
             let (frames, height, width) = outcome.frames.dim();
             let size = blocks(height, width);
             let levels = vec![DARK; frames * size.0 * size.1];
-            return Some(Self { size, levels, motion: 0.0, unfamiliar: false, prediction: None });
+            return Some(Self {
+                size,
+                levels,
+                motion: 0.0,
+                unfamiliar: false,
+                prediction: None,
+                order: None,
+            });
         };
         let evidence = outcome.evidence.as_ref().or(evidence);
         let errors = model.log_errors(features, evidence);
@@ -64,7 +75,8 @@ impl TileAssessment {
         let motion = fastest(outcome.frames.view(), white);
         let levels = errors.iter().map(level).collect();
         let prediction = evidence.and_then(|evidence| evidence.prediction);
-        Some(Self { size: (rows, columns), levels, motion, unfamiliar, prediction })
+        let order = evidence.and_then(|evidence| evidence.order);
+        Some(Self { size: (rows, columns), levels, motion, unfamiliar, prediction, order })
     }
 
     /// True if it has a block structure that `frames` frames of `height` x `width` pixels can have.
@@ -126,7 +138,7 @@ pub fn expected(
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
     let block_centre = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
     let (mut lit, mut motion, mut unfamiliar) = (false, 0.0f32, false);
-    let mut predictions = Vec::new();
+    let (mut predictions, mut orders) = (Vec::new(), Vec::new());
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
@@ -134,6 +146,7 @@ pub fn expected(
             motion = motion.max(assessed.motion);
             unfamiliar |= assessed.unfamiliar;
             predictions.extend(assessed.prediction);
+            orders.extend(assessed.order);
             let weights = plan.weights(&tile);
             let inside = |at: usize, first: usize, length: usize| {
                 at.checked_sub(first).filter(|at| *at < length)
@@ -170,6 +183,7 @@ pub fn expected(
     let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);
     let mut reasons = reasons(&error, (psnr_db, peak), warnings);
     reasons.extend(unexplained_pixels(&predictions));
+    reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
     reasons.extend(unfamiliar.then(unfamiliar_masks_finding));
     let stated = |decibels| (!is_in_doubt(&reasons)).then(|| Assessment::round(decibels));
@@ -178,6 +192,7 @@ pub fn expected(
         psnr_db: stated(psnr_db),
         psnr_low_db: stated(low),
         psnr_high_db: stated(high),
+        order: common_order(&orders),
         reasons,
     };
     Some(Expected { assessment, error })
@@ -187,11 +202,12 @@ pub fn expected(
 /// knows only results with the right ones.
 fn is_in_doubt(findings: &[Finding]) -> bool {
     use FindingCode::{
-        BadCalibration, ForeignMasks, MaskScale, Mosaic, Negative, NegativeOffset, NoDark,
-        ShiftedMasks, UnexplainedPixels, WrongDark,
+        BadCalibration, ExchangedMasks, ForeignMasks, MaskScale, Mosaic, Negative, NegativeOffset,
+        NoDark, ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
     };
-    const DOUBTS: [FindingCode; 10] = [
+    const DOUBTS: [FindingCode; 12] = [
         BadCalibration,
+        ExchangedMasks,
         ForeignMasks,
         MaskScale,
         Mosaic,
@@ -199,10 +215,46 @@ fn is_in_doubt(findings: &[Finding]) -> bool {
         NegativeOffset,
         NoDark,
         ShiftedMasks,
+        TurnedMasks,
         UnexplainedPixels,
         WrongDark,
     ];
-    findings.iter().any(|finding| DOUBTS.iter().any(|code| finding.is(*code)))
+    // Where many pixels were not measured, the model does not know how many.
+    let lacks_pixels = |finding: &Finding| {
+        finding.severity == Severity::Error
+            && (finding.is(FindingCode::Saturated) || finding.is(FindingCode::BadPixels))
+    };
+    findings
+        .iter()
+        .any(|finding| lacks_pixels(finding) || DOUBTS.iter().any(|code| finding.is(*code)))
+}
+
+/// The order by the majority of the tiles that show it; `None` if there is no test.
+fn common_order(orders: &[Order]) -> Option<MaskOrder> {
+    let count = |is: fn(&Order) -> bool| orders.iter().filter(|order| is(order)).count();
+    let exchanged = count(|order| matches!(order, Order::Exchanged(..)));
+    let consistent = count(|order| *order == Order::Consistent);
+    match (exchanged, consistent) {
+        _ if orders.is_empty() => None,
+        (0, 0) => Some(MaskOrder::NotVerifiable),
+        _ if exchanged > consistent => Some(MaskOrder::Doubtful),
+        _ => Some(MaskOrder::Consistent),
+    }
+}
+
+/// Reports frames that follow one another much more steadily after an exchange.
+fn exchanged_masks(orders: &[Order]) -> Option<Finding> {
+    let pair = orders.iter().find_map(|order| match order {
+        Order::Exchanged(first, second) => Some((*first, *second)),
+        _ => None,
+    });
+    let (first, second) = pair.filter(|_| common_order(orders) == Some(MaskOrder::Doubtful))?;
+    let detail = format!(
+        "the frames would follow one another more steadily if frames {first} and {second} (counted from 0) were \
+         exchanged: the masks are probably in a wrong order"
+    );
+    let finding = Finding::new(FindingCode::ExchangedMasks, detail);
+    Some(Finding { frames: vec![first, second], ..finding })
 }
 
 /// Largest squared error of the frames' prediction of hold-out pixels, relative to the prediction by the pixels around
@@ -331,7 +383,14 @@ mod tests {
     /// A tile of 2 frames of 32x32 pixels with this expected PSNR.
     fn tile(decibels: u8) -> TileAssessment {
         let (levels, motion) = (vec![4 * decibels; 8], 4.0);
-        TileAssessment { size: (2, 2), levels, motion, unfamiliar: false, prediction: None }
+        TileAssessment {
+            size: (2, 2),
+            levels,
+            motion,
+            unfamiliar: false,
+            prediction: None,
+            order: None,
+        }
     }
 
     #[test]
@@ -412,8 +471,14 @@ mod tests {
         assert!(assess(incomplete).is_none());
         // Tiles without light do not contribute.
         let (levels, motion) = (vec![DARK; 8], 0.0);
-        let dark =
-            TileAssessment { size: (2, 2), levels, motion, unfamiliar: false, prediction: None };
+        let dark = TileAssessment {
+            size: (2, 2),
+            levels,
+            motion,
+            unfamiliar: false,
+            prediction: None,
+            order: None,
+        };
         assert!(assess(vec![Some(dark.clone()); 4]).is_none());
         let mut lit = tiles([25; 4]);
         lit[3] = Some(dark);
@@ -428,6 +493,7 @@ mod tests {
             psnr_db: Some(psnr_db),
             psnr_low_db: Some(psnr_db - 3.0),
             psnr_high_db: Some(psnr_db + 3.0),
+            order: None,
             reasons: reasons.to_vec(),
         };
         let warned = [finding(Severity::Warning)];

@@ -67,7 +67,7 @@ impl Quality {
 }
 
 impl Quality {
-    /// The same quality with the PSNR relative to another peak than 1.
+    /// Makes the PSNR relative to another peak than 1.
     #[must_use]
     pub fn relative_to(mut self, peak: f32) -> Self {
         let gain = 20.0 * f64::from(peak).log10();

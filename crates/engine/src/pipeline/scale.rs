@@ -15,7 +15,7 @@ use reconstruction::scale::ScaleEstimator;
 pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
     let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
     let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
-    let whites = of_lit_snapshots(whites)?;
+    let whites = lit_snapshots(whites)?;
     let none = || ReconError::Shape {
         what: "the measurement",
         found: "no snapshots".into(),
@@ -39,7 +39,7 @@ pub fn job_white_level(
         let white = estimator.white(arrays.snapshot(snapshot)?.view());
         whites.push(white.map_err(|source| PipelineError::Snapshot { snapshot, source }));
     }
-    let whites = of_lit_snapshots(whites)?;
+    let whites = lit_snapshots(whites)?;
     let none = || PipelineError::Record { what: "job", problem: "it has no snapshots".into() };
     median_white(whites).ok_or_else(none)
 }
@@ -48,7 +48,7 @@ pub fn job_white_level(
 ///
 /// # Errors
 /// The last error, if there are only errors.
-fn of_lit_snapshots<E>(whites: impl IntoIterator<Item = Result<f32, E>>) -> Result<Vec<f32>, E> {
+fn lit_snapshots<E>(whites: impl IntoIterator<Item = Result<f32, E>>) -> Result<Vec<f32>, E> {
     let (mut lit, mut failure) = (Vec::new(), None);
     for white in whites {
         match white {
@@ -93,7 +93,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Adds samples. Those that are not finite are left out.
+    /// Adds the finite ones of some samples.
     pub fn add<'a>(&mut self, samples: impl IntoIterator<Item = &'a f32>) {
         for sample in samples.into_iter().filter(|sample| sample.is_finite()) {
             self.total += 1;
@@ -128,7 +128,7 @@ mod tests {
     use super::{Histogram, median_white};
 
     #[test]
-    fn the_white_level_is_the_999th_permille_in_any_order_and_on_any_scale() {
+    fn white_levels_do_not_depend_on_order_and_unit() {
         let samples: Vec<f32> = (0..10_000).map(|k| (k * 7919 % 10_000) as f32 / 1e4).collect();
         let white = |scale: f32| {
             let (mut whole, mut parts) = (Histogram::default(), Histogram::default());

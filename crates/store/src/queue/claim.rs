@@ -78,6 +78,8 @@ pub struct CalibrationTask {
     pub calibration: CalibrationId,
     /// Captures, of which masks are to be made; none where only a report on the masks is.
     pub captures: Option<Captures>,
+    /// A map of bad pixels, for masks that are made of captures.
+    pub bad_pixels: Option<Sha256>,
     /// The masks, a planar array, if they are there.
     pub masks: Option<Sha256>,
 }
@@ -345,11 +347,12 @@ impl Store {
         let request = requests::find(&mut connection, id.into()).await?;
         let masks = sql_as!("SELECT prepared FROM calibrations WHERE id = ?", [id]);
         let masks = masks.fetch_optional(&mut *connection).await?;
-        let captures = match request.submission {
-            Submission::Calibration(request) => request.captures,
-            Submission::Measurement(_) | Submission::Model(_) => None,
+        let (captures, bad_pixels) = match request.submission {
+            Submission::Calibration(request) => (request.captures, request.bad_pixels),
+            Submission::Measurement(_) | Submission::Model(_) => (None, None),
         };
-        Ok(Work::Calibration(Box::new(CalibrationTask { calibration: id, captures, masks })))
+        let task = CalibrationTask { calibration: id, captures, bad_pixels, masks };
+        Ok(Work::Calibration(Box::new(task)))
     }
 }
 
