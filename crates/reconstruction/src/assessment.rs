@@ -1,9 +1,10 @@
 //! The quality model: predicts the error of frames without the true ones.
 //!
-//! A lab has no true frames, but several features correlate with the error: texture and temporal changes of the frames,
-//! their distance from those after total variation, activations of the denoiser's first layers, the contrast of the
-//! masks, and estimates from hold-out pixels ([`super::signs`]). Small networks predict the error of each block from them.
-//! They were fitted to simulated snapshots of many scenes. `docs/BENCHMARKS.md` states their error on other scenes.
+//! A lab has no true frames, but several features correlate with the error. Features of the frames are their texture,
+//! their temporal changes, their distance from the frames after total variation, and activations of the denoiser's
+//! first layers. The contrast of the masks and estimates from hold-out pixels ([`super::signs`]) complete them. Small
+//! networks predict the error of each block from these features. They were fitted to simulated snapshots of many
+//! scenes. `docs/BENCHMARKS.md` states their error on other scenes.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -141,8 +142,8 @@ pub fn encoded_features(
     })
 }
 
-/// Features of the result of a stage that was run twice: those of the result, those of the first run, and the decimal
-/// logarithm of the mean squared distance between the frames of both \[2 x features + 1, S B, rows, columns\].
+/// Features of a stage that was run twice \[2 x features + 1, S B, rows, columns\]: those of the result, then those of the
+/// first run. The last one is the decimal logarithm of the mean squared distance between the frames of both.
 ///
 /// # Errors
 /// Sizes that disagree.
@@ -424,7 +425,7 @@ struct Scaling {
     scale: Vec<f32>,
 }
 
-/// Principal components of the encoder's features: for each channel a weight in each component. Their values are bounded.
+/// Principal components of the encoder's features: for each channel a weight in each component. Values are clamped.
 #[derive(Debug, Deserialize)]
 struct Encoding {
     mean: Vec<f32>,
@@ -455,7 +456,7 @@ static MODELS: LazyLock<BTreeMap<String, Model>> = LazyLock::new(|| {
 });
 
 impl Model {
-    /// The model for results of a schedule as it was run, if there is one. There are models for total variation alone, and
+    /// The model for results of a fixed schedule, if there is one. There are models for total variation alone, and
     /// for total variation followed by priors of the default schedule, with weak or strong temporal shrinkage.
     pub fn of(schedule: &Schedule) -> Option<&'static Self> {
         if schedule.method != Method::Gap {
@@ -556,7 +557,7 @@ const MIN_SHARE: f32 = 0.1;
 /// logarithms \[S B, rows, columns\].
 ///
 /// In a static scene the second run removes error, so the first run is as far from the result as from the true frames.
-/// Where it removes motion, the first run's error exceeds the distance by the error that both runs share. The weakly shrunk
+/// If it removes motion, the first run's error exceeds the distance by the error that both runs share. The weakly shrunk
 /// frames of the first run show that error.
 fn combine_runs(
     result: &Array3<f32>,
@@ -805,9 +806,9 @@ mod tests {
         let distant = with(&(ramp() + 1.0));
         assert_eq!(strong.log_errors(&distant, None), alone, "large distance: a static scene");
         let moving = strong.log_errors(&with(&(ramp() + 1e-3)), None);
-        let of_first_run = weak.log_errors(&first, None);
+        let expected = weak.log_errors(&first, None);
         let difference =
-            (&moving - &of_first_run).iter().fold(0.0, |largest: f32, d| largest.max(d.abs()));
+            (&moving - &expected).iter().fold(0.0, |largest: f32, d| largest.max(d.abs()));
         assert!(difference < 0.02, "small distance, large error: {difference}");
         let evidence = Evidence::new(Signs([-10.0; SIGNS.len()]), &result);
         let first = Some(Box::new(evidence.clone()));

@@ -19,13 +19,13 @@ use ndarray::{Array3, ArrayView3, azip};
 
 use super::admm;
 use super::error::{ReconError, Result};
-use super::iterate::Iterate;
-use super::operator::Statistics;
+use super::iterate::{Iterate, Variables};
+use super::operator::{SensingOperator, Statistics};
 use super::priors::{Networks, Prior};
 use super::progress::{Control, Observer, Progress};
 use super::projection::{Problem, Projection, Settings, Step};
 use super::schedule::{Method, Schedule};
-use super::stage::Stage;
+use super::stage::{ProjectionSpec, Stage};
 
 /// Runs a stage: up to `stage.iterations` times projection, prior and extrapolation.
 ///
@@ -41,7 +41,7 @@ pub(crate) fn run_stage(
     mut after: impl FnMut(ArrayView3<'_, f32>, bool) -> ControlFlow<()>,
 ) -> Result<bool> {
     let Solver { problem, method, gamma, y_norm, iterate, networks, counts } = solver;
-    let settings = Settings::new(problem.operator, stage, *gamma);
+    let settings = settings(problem.operator, stage, *gamma);
     let mut prior = stage.prior.start(problem.operator.dim(), &mut **networks)?;
     for iteration in 0..stage.iterations {
         let sigma = stage.sigma_at(iteration);
@@ -92,6 +92,14 @@ fn iterate(
     Ok(step)
 }
 
+/// The settings of a stage's iterations; `gamma` is the noise term of a stage without one.
+fn settings(operator: &SensingOperator, stage: &Stage, gamma: f32) -> Settings {
+    let ProjectionSpec { memory, static_variance, gamma: own } = stage.projection;
+    let covariance = static_variance.map(|variance| operator.error_covariance(variance));
+    let statistics = Statistics { covariance, gamma: own.unwrap_or(gamma) };
+    Settings { memory, momentum: stage.momentum, statistics }
+}
+
 /// A reconstruction in progress.
 pub(crate) struct Solver<'a> {
     problem: Problem<'a>,
@@ -135,12 +143,17 @@ impl<'a> Solver<'a> {
     ) -> Self {
         let squares: f64 = problem.y.iter().map(|&value| f64::from(value) * f64::from(value)).sum();
         let planned = schedule.planned_iterations();
+        let variables = Variables {
+            y1: schedule.accelerated,
+            w: schedule.extrapolates(),
+            u: schedule.method == Method::Admm,
+        };
         Self {
             problem,
             method: schedule.method,
             gamma: schedule.gamma,
             y_norm: squares.sqrt().max(f64::MIN_POSITIVE),
-            iterate: Iterate::zeros(problem.operator, schedule),
+            iterate: Iterate::zeros(problem.operator, variables),
             networks,
             counts: Counts { done: 0, planned, total_variation: 0, network: 0 },
         }

@@ -5,7 +5,14 @@ use std::ops::Range;
 use ndarray::{Array3, Axis};
 
 use super::operator::SensingOperator;
-use super::schedule::{Method, Schedule};
+
+/// The variables that a reconstruction needs besides `v`.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Variables {
+    pub(crate) y1: bool,
+    pub(crate) w: bool,
+    pub(crate) u: bool,
+}
 
 /// The variables that one iteration hands to the next.
 pub(crate) struct Iterate {
@@ -24,13 +31,13 @@ pub(crate) struct Iterate {
 impl Iterate {
     /// All zero. `y1` is kept through all stages: resetting it between total variation and a learned denoiser loses the
     /// gain of the acceleration.
-    pub(crate) fn zeros(operator: &SensingOperator, schedule: &Schedule) -> Self {
+    pub(crate) fn zeros(operator: &SensingOperator, variables: Variables) -> Self {
         let zeros = || Array3::zeros(operator.dim());
         Self {
             v: zeros(),
-            y1: schedule.accelerated.then(|| Array3::zeros(operator.measurement_dim())),
-            w: schedule.extrapolates().then(zeros),
-            u: (schedule.method == Method::Admm).then(zeros),
+            y1: variables.y1.then(|| Array3::zeros(operator.measurement_dim())),
+            w: variables.w.then(zeros),
+            u: variables.u.then(zeros),
             x: zeros(),
         }
     }

@@ -59,10 +59,10 @@ pub fn compare(
         let y = y.slice(s![snapshots.start - first..snapshots.end - first, .., ..]);
         let Measured { op, y } = Measured::new(&op, y);
         let (op, y) = (&*op, y.view());
-        let held_out = HoldOut::draw(op, snapshots.start);
-        let seen = op.clone().without(&held_out.pixels);
-        match solver::reconstruct(&seen, y, &schedule, networks, observer) {
-            Ok(outcome) => Ok(held_out.squares(op, y, outcome.frames.view())),
+        let hold_out = HoldOut::draw(op, snapshots.start);
+        let reduced = op.clone().without(&hold_out.pixels);
+        match solver::reconstruct(&reduced, y, &schedule, networks, observer) {
+            Ok(outcome) => Ok(hold_out.squares(op, y, outcome.frames.view())),
             Err(ReconError::Diverged { .. }) => Ok((f64::INFINITY, 1.0)),
             Err(error) => Err(error),
         }
@@ -72,15 +72,15 @@ pub fn compare(
     let mut last = None;
     for &after in joints {
         let mut alone = |snapshot: usize| match last {
-            Some((found, squares)) if found == snapshot => Ok(squares),
+            Some((known, squares)) if known == snapshot => Ok(squares),
             _ => errors(snapshot..snapshot + 1),
         };
-        let (before, behind) = (alone(after)?, alone(after + 1)?);
-        last = Some((after + 1, behind));
+        let (before, next) = (alone(after)?, alone(after + 1)?);
+        last = Some((after + 1, next));
         let together = errors(after..after + 2)?;
         findings.push(JointFinding {
             after,
-            alone: ((before.0 + behind.0) / (before.1 + behind.1)).sqrt(),
+            alone: ((before.0 + next.0) / (before.1 + next.1)).sqrt(),
             together: (together.0 / together.1).sqrt(),
         });
     }
@@ -95,8 +95,8 @@ mod tests {
     use ndarray::{Array3, Axis, stack};
     use optics::{iid_masks, measure};
 
-    /// Of two snapshots of a still scene, or of two scenes.
-    fn find(cut: bool) -> JointFinding {
+    /// Compares two snapshots of a still scene, or of two scenes.
+    fn compared(cut: bool) -> JointFinding {
         let masks = iid_masks(6, 64, 64, 3).unwrap();
         let frames = |sign: f32| {
             Array3::from_shape_fn((6, 64, 64), |(_, i, j)| {
@@ -104,8 +104,8 @@ mod tests {
             })
         };
         let snapshot = |sign| measure(masks.view(), frames(sign).view()).unwrap();
-        let (before, behind) = (snapshot(1.0), snapshot(if cut { -1.0 } else { 1.0 }));
-        let y = stack(Axis(0), &[before.view(), behind.view()]).unwrap();
+        let (before, next) = (snapshot(1.0), snapshot(if cut { -1.0 } else { 1.0 }));
+        let y = stack(Axis(0), &[before.view(), next.view()]).unwrap();
         let op = SensingOperator::new(masks.clone()).unwrap();
         let schedule = Schedule { adaptive: false, ..Schedule::gap_tv3d() };
         compare(&op, (5, y.view()), &[5], &schedule, &mut (), &mut ()).unwrap()[0]
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn snapshots_of_one_scene_belong_together_and_those_of_two_do_not() {
-        let (still, cut) = (find(false), find(true));
+        let (still, cut) = (compared(false), compared(true));
         assert_eq!(still.after, 5);
         assert!(still.belong_together() && !cut.belong_together(), "{still:?} {cut:?}");
     }

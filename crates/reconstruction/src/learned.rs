@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_told_with_what_would() {
+    fn a_misfit_is_reported_with_the_required_tensor() {
         let message = |network: &Interface| network.check(4, 48, 64).unwrap_err().to_string();
         let text = message(&network(8, 48, 64));
         assert!(text.contains("masks") && text.contains("[1,8,48,64]"), "{text}");

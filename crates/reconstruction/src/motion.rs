@@ -61,8 +61,9 @@ impl Steps {
         let determinant = down * right - self.both * self.both;
         let rows = (self.both * self.slope_right - right * self.slope_down) / determinant;
         let columns = (self.both * self.slope_down - down * self.slope_right) / determinant;
-        let rest = (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
-        ((rows, columns), rest / self.slope.max(FLOOR))
+        let unexplained =
+            (self.slope + rows * self.slope_down + columns * self.slope_right).max(0.0);
+        ((rows, columns), unexplained / self.slope.max(FLOOR))
     }
 }
 
@@ -78,17 +79,17 @@ pub fn fastest(frames: ArrayView3<'_, f32>, white: f32) -> f32 {
     let range = |part: usize, length: usize| {
         part * length / parts(length)..(part + 1) * length / parts(length)
     };
-    let mut most = 0.0f32;
+    let mut fastest = 0.0f32;
     for row in 0..parts(rows) {
         for column in 0..parts(columns) {
             let window = coarse.slice(s![.., range(row, rows), range(column, columns)]);
-            let ((down, right), rest) = steps(window).motion();
-            if rest <= 1.0 - EXPLAINED {
-                most = most.max(down.hypot(right) * CELL as f32);
+            let ((down, right), unexplained) = steps(window).motion();
+            if unexplained <= 1.0 - EXPLAINED {
+                fastest = fastest.max(down.hypot(right) * CELL as f32);
             }
         }
     }
-    most
+    fastest
 }
 
 /// Motion of each part of a clip, in pixels per frame.
@@ -114,27 +115,27 @@ impl Motion {
         if count < 2 || rows < 3 || columns < 3 {
             return Self::none();
         }
-        let told = |window: ArrayView3<'_, f32>| {
+        let estimate = |window: ArrayView3<'_, f32>| {
             let ((down, right), _) = steps(window).motion();
-            let most = down.abs().max(right.abs());
-            (most <= 1.0).then_some((down * CELL as f32, right * CELL as f32))
+            let cells = down.abs().max(right.abs());
+            (cells <= 1.0).then_some((down * CELL as f32, right * CELL as f32))
         };
-        let whole = told(coarse.view());
+        let whole = estimate(coarse.view());
         // At least three cells, because fewer have no gradient.
-        let near = |at: usize, reach: usize, length: usize| {
+        let around = |at: usize, reach: usize, length: usize| {
             let start = at.saturating_sub(reach).min(length - 3);
             start..(at + reach + 1).clamp(start + 3, length)
         };
         let of_cells = Array2::from_shape_fn((rows, columns), |(row, column)| {
-            let around = s![.., near(row, REACH, rows), near(column, REACH, columns)];
+            let window = s![.., around(row, REACH, rows), around(column, REACH, columns)];
             let pixels = |cells: Range<usize>| cells.start * CELL..cells.end * CELL;
-            let area = (pixels(near(row, 1, rows)), pixels(near(column, 1, columns)));
+            let area = (pixels(around(row, 1, rows)), pixels(around(column, 1, columns)));
             let mut best = (0.0, 0.0);
-            let mut least = difference(frames, &area, best);
-            for motion in [told(coarse.slice(around)), whole].into_iter().flatten() {
-                let left = difference(frames, &area, motion);
-                if left < least {
-                    (best, least) = (motion, left);
+            let mut smallest = difference(frames, &area, best);
+            for motion in [estimate(coarse.slice(window)), whole].into_iter().flatten() {
+                let difference = difference(frames, &area, motion);
+                if difference < smallest {
+                    (best, smallest) = (motion, difference);
                 }
             }
             best
@@ -212,7 +213,7 @@ mod tests {
     use super::{Motion, fastest};
     use ndarray::{Array3, s};
 
-    /// Coarse and fine texture that moves by so many rows and columns a frame.
+    /// Coarse and fine texture that moves by `rows` and `columns` pixels per frame.
     fn moving(rows: f32, columns: f32) -> Array3<f32> {
         Array3::from_shape_fn((8, 160, 300), |(k, i, j)| {
             let (i, j) = (i as f32 - rows * k as f32, j as f32 - columns * k as f32);
@@ -222,16 +223,16 @@ mod tests {
     }
 
     #[test]
-    fn the_speed_of_coarse_structure_is_found() {
+    fn the_speed_of_coarse_structure_is_estimated() {
         for (rows, columns) in [(0.0, 0.0), (0.0, 3.0), (-2.0, 2.0), (6.0, 8.0), (10.0, 0.0)] {
-            let (expected, told) =
+            let (expected, speed) =
                 (f32::hypot(rows, columns), fastest(moving(rows, columns).view(), 1.0));
-            assert!((told - expected).abs() < 0.25 * expected + 0.1, "{rows}, {columns}: {told}");
+            assert!((speed - expected).abs() < 0.25 * expected + 0.1, "{rows}, {columns}: {speed}");
         }
     }
 
     #[test]
-    fn a_part_that_moves_is_seen_beside_one_at_rest_and_a_light_that_changes_is_no_motion() {
+    fn a_moving_part_is_detected_and_changing_light_is_no_motion() {
         let mut frames = moving(0.0, 0.0);
         frames.slice_mut(s![.., .., 150..]).assign(&moving(0.0, 9.0).slice(s![.., .., 150..]));
         assert!(fastest(frames.view(), 1.0) > 6.0, "{}", fastest(frames.view(), 1.0));
@@ -255,7 +256,7 @@ mod tests {
                 "{at:?}: {down}, {right}"
             );
         }
-        // Of a single frame, and of frames too small for cells, nothing is known.
+        // A single frame, and frames too small for cells, have no estimate.
         for frames in [frames.slice(s![..1, .., ..]), frames.slice(s![.., ..20, ..])] {
             assert_eq!(Motion::of(frames).at(10, 200), (0.0, 0.0));
         }

@@ -538,35 +538,35 @@ mod tests {
         }
     }
 
-    /// The sum of the covariance is the variance of what frames have in common times their number.
+    /// The sum of the covariance is the static variance times the number of frames.
     #[test]
     fn correlated_masks_have_a_smaller_static_variance() {
-        let common = |masks: Array3<f32>| {
+        let static_variance = |masks: Array3<f32>| {
             let frames = masks.dim().0 as f32;
             SensingOperator::new(masks).unwrap().error_covariance(0.5).sum() / frames
         };
-        let near = |found: f32, wanted: f32| {
-            assert!((found - wanted).abs() < 0.02, "{found}, not {wanted}")
+        let assert_close = |variance: f32, expected: f32| {
+            assert!((variance - expected).abs() < 0.02, "{variance}, not {expected}")
         };
         let masks = |contrast: f32| random(3, (4, 32, 32)).mapv(|c| 1.0 + contrast * (c - 0.5));
-        // Of the variance of four frames 3/4 shows as change.
-        near(common(masks(1.0)), 0.5 * (0.0577f32 / 0.125).powf(1.5));
-        near(common(masks(0.0)), 0.01);
+        // Three quarters of the variance of four independent frames are changes.
+        assert_close(static_variance(masks(1.0)), 0.5 * (0.0577f32 / 0.125).powf(1.5));
+        assert_close(static_variance(masks(0.0)), 0.01);
         let binary = |frames: usize| random(3, (frames, 32, 32)).mapv(f32::round);
-        near(common(binary(4)), 0.5 * 2.5f32.sqrt());
-        near(common(binary(20)), 0.5 * 0.5f32.sqrt());
+        assert_close(static_variance(binary(4)), 0.5 * 2.5f32.sqrt());
+        assert_close(static_variance(binary(20)), 0.5 * 0.5f32.sqrt());
         // Light through closed pixels: half and a third of the contrast of binary masks.
         let leaking = |frames: usize, light: f32| {
-            common(random(3, (frames, 32, 32)).mapv(|c| light + (1.0 - light) * c.round()))
+            static_variance(random(3, (frames, 32, 32)).mapv(|c| light + (1.0 - light) * c.round()))
         };
-        near(leaking(10, 0.23), 0.5 * 0.65);
-        near(leaking(10, 0.42), 0.5 * MIN_STATIC_SHARE);
+        assert_close(leaking(10, 0.23), 0.5 * 0.65);
+        assert_close(leaking(10, 0.42), 0.5 * MIN_STATIC_SHARE);
     }
 
-    /// A prior that takes the error of all frames out but one leaves there what the projection makes of it.
+    /// A prior that removes the error of all frames but one leaves that one to the projection.
     #[test]
     fn an_error_that_a_prior_keeps_in_some_frames_does_not_grow() {
-        // As alike as those of a hybrid coded aperture.
+        // Correlated like the masks of a hybrid coded aperture.
         let masks = random(5, (16, 12, 12)).mapv(|c| 0.4 + 0.3 * c);
         let op = SensingOperator::new(masks).unwrap();
         let covariance = Some(op.error_covariance(0.5));
@@ -581,8 +581,8 @@ mod tests {
                 v.slice_mut(ndarray::s![kept, .., ..]).assign(&x.slice(ndarray::s![kept, .., ..]));
             }
             // 1.02^65.
-            let most = v.iter().copied().fold(0.0, f32::max);
-            assert!(most < 3.63, "frame {kept}: {most}");
+            let error = v.iter().copied().fold(0.0, f32::max);
+            assert!(error < 3.63, "frame {kept}: {error}");
         }
     }
 
@@ -609,7 +609,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_where_hardly_any_light_comes_through_stays_noise() {
+    fn noise_of_dark_pixels_is_not_amplified() {
         let mut masks = random(3, (4, 3, 3));
         masks.slice_mut(ndarray::s![.., 1, 1]).fill(1e-7);
         let op = SensingOperator::new(masks).unwrap();

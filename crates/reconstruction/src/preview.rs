@@ -54,7 +54,7 @@ pub struct Blocks {
     /// Masks of the block \[B, pixels\], rounded up to whole registers with zeros.
     masks: Vec<f32>,
     /// Residual of the measurement.
-    rest: Vec<f32>,
+    residual: Vec<f32>,
     /// Lower triangle of the normal matrix \[B,B\], and then its Cholesky factor.
     normal: Vec<f32>,
     solution: Vec<f32>,
@@ -68,7 +68,7 @@ impl Blocks {
             side,
             frames,
             masks: vec![0.0; frames * pixels],
-            rest: vec![0.0; pixels],
+            residual: vec![0.0; pixels],
             normal: vec![0.0; frames * frames],
             solution: vec![0.0; frames],
         }
@@ -104,10 +104,12 @@ impl Blocks {
 
     /// Pixels that were not measured (NaN) become dark in mask and measurement.
     fn gather(&mut self, masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) {
-        let pixels = self.rest.len();
+        let pixels = self.residual.len();
         self.masks.fill(0.0);
-        self.rest.fill(0.0);
-        self.rest.iter_mut().zip(y).for_each(|(rest, &y)| *rest = if y.is_nan() { 0.0 } else { y });
+        self.residual.fill(0.0);
+        for (residual, &y) in self.residual.iter_mut().zip(y) {
+            *residual = if y.is_nan() { 0.0 } else { y };
+        }
         for (line, mask) in self.masks.chunks_exact_mut(pixels).zip(masks.outer_iter()) {
             for ((value, &c), y) in line.iter_mut().zip(mask).zip(y) {
                 *value = if y.is_nan() { 0.0 } else { c };
@@ -117,11 +119,11 @@ impl Blocks {
 
     /// `x = m + (C C^T + ridge)^-1 C (y - C^T m)` with the block's mean `m` of all frames.
     fn solve(&mut self) {
-        let (frames, pixels) = (self.frames, self.rest.len());
+        let (frames, pixels) = (self.frames, self.residual.len());
         let light: f32 = self.masks.iter().sum();
-        let mean = if light > 0.0 { self.rest.iter().sum::<f32>() / light } else { 0.0 };
+        let mean = if light > 0.0 { self.residual.iter().sum::<f32>() / light } else { 0.0 };
         for mask in self.masks.chunks_exact(pixels) {
-            self.rest.iter_mut().zip(mask).for_each(|(rest, &c)| *rest -= c * mean);
+            self.residual.iter_mut().zip(mask).for_each(|(residual, &c)| *residual -= c * mean);
         }
         let mask = |k: usize| &self.masks[k * pixels..(k + 1) * pixels];
         for i in 0..frames {
@@ -129,7 +131,7 @@ impl Blocks {
                 self.normal[i * frames + j] = dot(mask(i), mask(j));
             }
             self.normal[i * frames + i] += RIDGE;
-            self.solution[i] = dot(mask(i), &self.rest);
+            self.solution[i] = dot(mask(i), &self.residual);
         }
         cholesky(&mut self.normal, &mut self.solution);
         self.solution.iter_mut().for_each(|value| *value += mean);
@@ -159,9 +161,9 @@ fn cholesky(a: &mut [f32], b: &mut [f32]) {
     for i in 0..n {
         for j in 0..=i {
             let known: f32 = (0..j).map(|k| a[i * n + k] * a[j * n + k]).sum();
-            let rest = a[i * n + j] - known;
+            let remainder = a[i * n + j] - known;
             // The ridge keeps the diagonal above 0.
-            a[i * n + j] = if i == j { rest.sqrt() } else { rest / a[j * n + j] };
+            a[i * n + j] = if i == j { remainder.sqrt() } else { remainder / a[j * n + j] };
         }
     }
     for i in 0..n {
@@ -181,7 +183,7 @@ mod tests {
     use optics::{iid_masks, measure};
 
     #[test]
-    fn large_pictures_are_done_by_blocks_with_equations_enough() {
+    fn large_pictures_are_solved_by_blocks_with_enough_equations() {
         assert_eq!(block(10, 256, 256), 1);
         assert_eq!(block(10, 3200, 3200), 5);
         assert_eq!(block(30, 3200, 3200), 8);
@@ -189,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn even_blocks_come_back_and_the_last_may_be_narrower() {
+    fn flat_blocks_are_recovered_and_the_last_may_be_narrower() {
         let (side, frames) = (6, 8);
         let masks = iid_masks(frames, 12, 27, 5).unwrap();
         let truth = Array3::from_shape_fn((frames, 12, 27), |(k, i, j)| {

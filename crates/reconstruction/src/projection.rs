@@ -6,7 +6,6 @@ use ndarray::Array3;
 
 use super::iterate::{Change, Iterate};
 use super::operator::{Accumulation, SensingOperator, Statistics};
-use super::stage::{ProjectionSpec, Stage};
 
 /// A measurement \[S,H,W\] and its operator.
 #[derive(Debug, Clone, Copy)]
@@ -19,20 +18,11 @@ pub(crate) struct Problem<'a> {
 /// The settings of a stage's iterations.
 pub(crate) struct Settings {
     /// Share of the accumulated residual that is kept.
-    memory: f32,
+    pub(crate) memory: f32,
     /// Factor of the extrapolation.
     pub(crate) momentum: f32,
-    statistics: Statistics,
-}
-
-impl Settings {
-    /// The settings of `stage`; `gamma` is the noise term of stages without one.
-    pub(crate) fn new(operator: &SensingOperator, stage: &Stage, gamma: f32) -> Self {
-        let ProjectionSpec { memory, static_variance, gamma: own } = stage.projection;
-        let covariance = static_variance.map(|variance| operator.error_covariance(variance));
-        let statistics = Statistics { covariance, gamma: own.unwrap_or(gamma) };
-        Self { memory, momentum: stage.momentum, statistics }
-    }
+    /// Covariance of the frames' errors, and variance of the noise.
+    pub(crate) statistics: Statistics,
 }
 
 /// `x = w + R H^T (H R H^T + gamma)^-1 (y1 - H w)`, computed as a prior asks for it.
@@ -113,8 +103,8 @@ impl<'a> Projection<'a> {
 #[cfg(test)]
 mod tests {
     use super::{Problem, Projection, Settings};
-    use crate::iterate::{Change, Iterate};
-    use crate::operator::SensingOperator;
+    use crate::iterate::{Change, Iterate, Variables};
+    use crate::operator::{SensingOperator, Statistics};
     use crate::schedule::Schedule;
     use ndarray::Array3;
     use rand::{Rng, SeedableRng};
@@ -131,10 +121,12 @@ mod tests {
         let y = operator.forward(random().view()).unwrap();
         let schedule = Schedule::gap_tv3d();
         let stage = &schedule.stages[0];
-        let settings = Settings::new(&operator, stage, 0.0);
+        let statistics = Statistics::default();
+        let settings = Settings { memory: 1.0, momentum: 0.0, statistics };
+        let variables = Variables { y1: true, w: false, u: false };
         let problem = Problem { operator: &operator, y: &y };
         let run = |by_strips: bool| {
-            let mut iterate = Iterate { v: v.clone(), ..Iterate::zeros(&operator, &schedule) };
+            let mut iterate = Iterate { v: v.clone(), ..Iterate::zeros(&operator, variables) };
             let mut networks = ();
             let mut prior = stage.prior.start(size, &mut networks).unwrap();
             let mut projection = Projection::new(problem, &settings, &mut iterate);

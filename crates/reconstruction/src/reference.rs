@@ -125,7 +125,7 @@ impl Problem {
             // The snapshot's own frames at this pixel, and the masks there.
             let (first, pixel) = (p / plane * mask.len(), p % plane);
             let voxels = || (pixel..mask.len()).step_by(plane);
-            let seen: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
+            let measured: f64 = voxels().map(|voxel| mask[voxel] * w[first + voxel]).sum();
             let total_of = |part: &dyn Fn(usize) -> f64| -> f64 {
                 voxels().map(|voxel| mask[voxel] * part(voxel)).sum::<f64>() + f64::from(gamma)
             };
@@ -134,11 +134,11 @@ impl Problem {
             let total = total_of(&bounded);
             let mut target = f64::from(y);
             if self.schedule.accelerated {
-                y1[p] = target + f64::from(memory) * (y1[p] - seen);
+                y1[p] = target + f64::from(memory) * (y1[p] - measured);
                 target = y1[p];
             }
             for voxel in voxels() {
-                x[first + voxel] += bounded(voxel) * (target - seen) / total;
+                x[first + voxel] += bounded(voxel) * (target - measured) / total;
             }
         }
         x

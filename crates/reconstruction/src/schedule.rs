@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn defaults_are_valid_and_survive_the_way_through_json() {
+    fn defaults_are_valid_and_survive_json() {
         for schedule in Schedule::defaults() {
             schedule.validate().unwrap();
             let text = serde_json::to_string(&schedule).unwrap();
@@ -235,7 +235,7 @@ mod tests {
         assert_eq!(at(0), first);
         assert!((at(stage.iterations - 1) - last).abs() < 1e-6);
         assert!((at(2) / at(1) - at(1) / at(0)).abs() < 1e-5);
-        // From 8 bits to floating point as from one iteration to the next.
+        // The step from 8 bits to floating point equals the step between iterations.
         let next = schedule.stages[2].sigma_at(0).unwrap();
         assert!((next / last - at(1) / at(0)).abs() < 1e-5);
     }
@@ -295,11 +295,11 @@ mod tests {
         let negative =
             json!({"prior": "tv", "iterations": 3, "tv_weight": 0.1, "temporal_weight": -0.1});
         let idle = json!({"prior": "tv", "iterations": 3, "tv_weight": 0.0, "tv_updates": 0});
-        let least =
+        let smallest =
             json!({"prior": "tv", "iterations": 3, "tv_weight": 0.0, "static_variance": 0.01});
         let lower =
             json!({"prior": "tv", "iterations": 3, "tv_weight": 0.0, "static_variance": 0.009});
-        let stages = json!({"stages": [tv, zero, deep, negative, idle, least, lower]});
+        let stages = json!({"stages": [tv, zero, deep, negative, idle, smallest, lower]});
         let expected = [
             "/stages/1/iterations",
             "/stages/2/sigma",
@@ -365,9 +365,12 @@ mod tests {
             let alternatives = schema["oneOf"].as_array().unwrap();
             let own = alternatives
                 .iter()
-                .find(|one| one["properties"]["prior"]["const"] == prior.as_str());
+                .find(|one| one["properties"]["prior"]["const"] == prior.as_str())
+                .unwrap();
+            let place = own["$ref"].as_str().unwrap().trim_start_matches('#');
+            let parameters = &schema.pointer(place).unwrap()["properties"];
             let known = |name: &String| {
-                !schema["properties"][name].is_null() || !own.unwrap()["properties"][name].is_null()
+                !schema["properties"][name].is_null() || !parameters[name].is_null()
             };
             let mut fields = every.as_object().unwrap().clone();
             fields.retain(|name, _| known(name));
@@ -382,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn one_deep_pass_weighs_as_thousands_of_tv_iterations() {
+    fn shares_of_the_work_follow_the_cost() {
         let schedule = Schedule::pnp_ffdnet();
         assert_eq!(schedule.share_done(0, 0), 0.0);
         assert!(schedule.share_done(1, 0) < 0.01, "after all TV iterations");

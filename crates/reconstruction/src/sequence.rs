@@ -102,13 +102,13 @@ impl SequencePlan {
                 };
                 let before = (0..run).rev().take_while(meets);
                 let after = (run + 1..self.runs.len()).take_while(meets);
-                let left_to = |other: usize| {
+                let is_covered_by = |other: usize| {
                     self.split(other, cuts).into_iter().any(|larger| {
                         let within = larger.start <= snapshots.start && snapshots.end <= larger.end;
                         within && (larger != snapshots || other < run)
                     })
                 };
-                if !before.chain(after).any(left_to) {
+                if !before.chain(after).any(is_covered_by) {
                     pieces.push(Piece { run, snapshots });
                 }
             }
@@ -189,14 +189,14 @@ mod tests {
     }
 
     #[test]
-    fn what_a_cut_leaves_of_an_overlap_is_done_once() {
+    fn an_overlap_that_is_cut_is_solved_once() {
         let plan = SequencePlan::new(0..7, 4, 1).unwrap();
         let pieces = |cuts: &[usize]| -> Vec<_> {
             plan.pieces(cuts).into_iter().map(|Piece { run, snapshots }| (run, snapshots)).collect()
         };
         assert_eq!(pieces(&[]), [(0, 0..4), (1, 3..7)]);
         assert_eq!(pieces(&[1]), [(0, 0..2), (0, 2..4), (1, 3..7)]);
-        // Before the shared snapshot, and behind it.
+        // Cuts before and after the shared snapshot.
         assert_eq!(pieces(&[2]), [(0, 0..3), (1, 3..7)]);
         assert_eq!(pieces(&[3]), [(0, 0..4), (1, 4..7)]);
         let all: Vec<usize> = (0..6).collect();

@@ -17,12 +17,12 @@ use super::operator::SensingOperator;
 pub const SIGNS: [&str; 8] = [
     "residual after the first stage",
     "residual of the frames",
-    "error, by residuals and texture nearby",
-    "what the frames have in common of it",
-    "error, by residuals nearby, if there is no noise",
-    "error, by texture nearby",
-    "residual where there is least texture",
-    "residual where there is most texture",
+    "error, by local residuals and texture",
+    "static part of the error",
+    "error, by local residuals, without noise",
+    "error, by local texture",
+    "residual of the pixels with the least texture",
+    "residual of the pixels with the most texture",
 ];
 
 /// Values of [`SIGNS`].
@@ -32,14 +32,14 @@ pub struct Signs(pub [f32; SIGNS.len()]);
 
 /// Squares below this are rounding errors.
 const FLOOR: f64 = 1e-7;
-/// Standard deviation of the weights of nearby residuals, in pixels.
-const NEARBY: f64 = 3.0;
+/// Standard deviation of the weights of surrounding residuals, in pixels.
+const WEIGHT_RADIUS: f64 = 3.0;
 /// Weight of the mean of all residuals.
-const FAR: f64 = 0.1;
+const MEAN_WEIGHT: f64 = 0.1;
 /// Radius of the square over which texture is measured, in pixels.
-const REACH: usize = 3;
-/// Share of the pixels that have the least, and the most, texture.
-const QUIET: f64 = 0.2;
+const TEXTURE_RADIUS: usize = 3;
+/// Share of the pixels with the least, and with the most, texture.
+const EXTREME_SHARE: f64 = 0.2;
 /// Number of steps of the fit, after which it no longer changes.
 const STEPS: usize = 150;
 
@@ -59,19 +59,20 @@ impl Signs {
         }
         let residuals = hold_out.residuals(op, y, last);
         let gram = op.gram();
-        let common = op.static_gram();
+        let static_gram = op.static_gram();
         let at = |image: &dyn Fn((usize, usize)) -> f64| -> Vec<f64> {
             hold_out.pixels.iter().map(|&(_, i, j)| image((i, j))).collect()
         };
-        let shared = at(&|p| f64::from(common[p]));
-        let changing = at(&|p| f64::from((gram[p] - common[p]).max(0.0)));
+        let shared = at(&|p| f64::from(static_gram[p]));
+        let changing = at(&|p| f64::from((gram[p] - static_gram[p]).max(0.0)));
         let mean_gram = at(&|p| f64::from(gram[p])).iter().sum::<f64>() / count;
         let texture = texture(last);
         let texture = at(&|p| texture[p]);
 
-        let near = local_residuals(hold_out, &residuals);
-        let rough = scaled(texture.iter().map(|texture| texture.sqrt()));
-        let both = scaled(near.iter().zip(&rough).map(|(near, rough)| (near * rough).sqrt()));
+        let local = local_residuals(hold_out, &residuals);
+        let textured = scaled(texture.iter().map(|texture| texture.sqrt()));
+        let both = local.iter().zip(&textured).map(|(local, textured)| (local * textured).sqrt());
+        let both = scaled(both);
         let frames = last.len_of(Axis(0)) as f64;
         let error = |scale: &[f64], noise: bool| {
             let times = |part: &[f64]| part.iter().zip(scale).map(|(part, s)| part * s).collect();
@@ -84,19 +85,19 @@ impl Signs {
         };
         let first = hold_out.residuals(op, y, early);
         let mean = |squares: &[f64]| squares.iter().sum::<f64>() / squares.len() as f64 / mean_gram;
-        let [quiet, loud] = extremes(&texture, &residuals);
-        let (told, common) = error(&both, true);
-        let told = [
+        let [smooth, busy] = extremes(&texture, &residuals);
+        let (both_errors, static_error) = error(&both, true);
+        let squares = [
             mean(&first),
             mean(&residuals),
-            told,
-            common,
-            error(&near, false).0,
-            error(&rough, true).0,
-            quiet / mean_gram,
-            loud / mean_gram,
+            both_errors,
+            static_error,
+            error(&local, false).0,
+            error(&textured, true).0,
+            smooth / mean_gram,
+            busy / mean_gram,
         ];
-        Some(Self(told.map(|square| (10.0 * square.max(FLOOR).log10()) as f32)))
+        Some(Self(squares.map(|square| (10.0 * square.max(FLOOR).log10()) as f32)))
     }
 }
 
@@ -112,11 +113,11 @@ fn scaled(values: impl Iterator<Item = f64>) -> Vec<f64> {
 fn local_residuals(hold_out: &HoldOut, residuals: &[f64]) -> Vec<f64> {
     let mean = residuals.iter().sum::<f64>() / residuals.len() as f64;
     let around = |(index, &(_, i, j)): (usize, &(usize, usize, usize))| {
-        let (mut sum, mut weights) = (FAR * mean, FAR);
+        let (mut sum, mut weights) = (MEAN_WEIGHT * mean, MEAN_WEIGHT);
         for (other, &(_, row, column)) in hold_out.pixels.iter().enumerate() {
             let distance = (i.abs_diff(row).pow(2) + j.abs_diff(column).pow(2)) as f64;
-            if other != index && distance < (4.0 * NEARBY).powi(2) {
-                let weight = (-0.5 * distance / NEARBY.powi(2)).exp();
+            if other != index && distance < (4.0 * WEIGHT_RADIUS).powi(2) {
+                let weight = (-0.5 * distance / WEIGHT_RADIUS.powi(2)).exp();
                 sum += weight * residuals[other];
                 weights += weight;
             }
@@ -143,8 +144,8 @@ fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
         }
     }
     Array2::from_shape_fn((height, width), |(i, j)| {
-        let rows = i.saturating_sub(REACH)..height.min(i + REACH + 1);
-        let columns = j.saturating_sub(REACH)..width.min(j + REACH + 1);
+        let rows = i.saturating_sub(TEXTURE_RADIUS)..height.min(i + TEXTURE_RADIUS + 1);
+        let columns = j.saturating_sub(TEXTURE_RADIUS)..width.min(j + TEXTURE_RADIUS + 1);
         steps.slice(s![rows, columns]).mean().unwrap_or(0.0)
     })
 }
@@ -153,7 +154,7 @@ fn texture(frames: ArrayView3<'_, f32>) -> Array2<f64> {
 fn extremes(texture: &[f64], squares: &[f64]) -> [f64; 2] {
     let mut order: Vec<usize> = (0..texture.len()).collect();
     order.sort_by(|a, b| texture[*a].total_cmp(&texture[*b]));
-    let count = ((texture.len() as f64 * QUIET) as usize).max(1);
+    let count = ((texture.len() as f64 * EXTREME_SHARE) as usize).max(1);
     let mean = |of: &[usize]| of.iter().map(|index| squares[*index]).sum::<f64>() / count as f64;
     [mean(&order[..count]), mean(&order[order.len() - count..])]
 }
@@ -196,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn variances_of_parts_are_found() {
+    fn variances_of_parts_are_estimated() {
         let mut random = random();
         let parts: Vec<Vec<f64>> =
             (0..2).map(|_| (0..20_000).map(|_| random.random::<f64>()).collect()).collect();
@@ -213,34 +214,34 @@ mod tests {
 
     /// Errors of a known size where there is texture, in the left half, with noise everywhere and without.
     #[test]
-    fn the_error_of_frames_is_told_from_noise() {
+    fn the_error_of_frames_is_distinguished_from_noise() {
         let (frames, side) = (8, 192);
         let masks = iid_masks(frames, side, side, 3).unwrap();
         let op = SensingOperator::new(masks).unwrap();
         let hold_out = HoldOut::draw(&op, 0);
-        let left = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
+        let texture = |j: usize| if j < side / 2 { 1.0 } else { 0.0 };
         let truth = Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
-            0.5 + 0.2 * left(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
+            0.5 + 0.2 * texture(j) * ((i + k) as f32 * 0.3).sin() * (j as f32 * 0.2).cos()
         });
         for (error, noise) in [(0.03f32, 0.0f32), (0.03, 0.06), (0.1, 0.06)] {
             let mut random = random();
             let mut normal = |deviation: f32| deviation * random.sample::<f32, _>(StandardNormal);
             let mut found = truth.clone();
-            found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * left(j));
+            found.indexed_iter_mut().for_each(|((_, _, j), x)| *x += normal(error) * texture(j));
             let y = op.forward(truth.view()).unwrap().mapv(|y| y + normal(noise));
-            let told = Signs::of((&op, y.view()), &hold_out, found.view(), found.view()).unwrap();
+            let signs = Signs::of((&op, y.view()), &hold_out, found.view(), found.view()).unwrap();
             let decibels = |square: f32| 10.0 * square.log10();
             let expected = decibels(error.powi(2) / 2.0);
-            let Signs([early, late, both, _, without_noise, by_texture, quiet, _]) = told;
+            let Signs([early, late, both, _, without_noise, by_texture, smooth, _]) = signs;
             assert_eq!(early, late);
-            assert!((by_texture - expected).abs() < 2.5, "{error}, {noise}: {told:?}");
-            assert!((both - expected).abs() < 4.0, "{error}, {noise}: {told:?}");
+            assert!((by_texture - expected).abs() < 2.5, "{error}, {noise}: {signs:?}");
+            assert!((both - expected).abs() < 4.0, "{error}, {noise}: {signs:?}");
             if noise == 0.0 {
-                assert!(quiet < expected - 10.0, "{told:?}");
+                assert!(smooth < expected - 10.0, "{signs:?}");
             } else {
                 // Half of the pixels are open.
-                assert!((quiet - decibels(noise.powi(2) / 4.0)).abs() < 1.5, "{told:?}");
-                assert!(without_noise > expected + 2.0, "noise is taken for an error: {told:?}");
+                assert!((smooth - decibels(noise.powi(2) / 4.0)).abs() < 1.5, "{signs:?}");
+                assert!(without_noise > expected + 2.0, "noise is taken for an error: {signs:?}");
             }
         }
     }

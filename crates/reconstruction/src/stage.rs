@@ -189,9 +189,14 @@ fn field_schemas(prior: Option<PriorName>) -> Fields {
         let name = &alternative["properties"]["prior"]["const"];
         prior.is_none_or(|prior| name == prior.as_str())
     });
-    let parts = std::iter::once(&*SCHEMA).chain(possible);
+    let parameters = possible.filter_map(|alternative| {
+        let place = alternative["$ref"].as_str()?.trim_start_matches('#');
+        SCHEMA.pointer(place)
+    });
+    let parts = std::iter::once(&*SCHEMA).chain(parameters);
     let properties = parts.filter_map(|part| part["properties"].as_object());
-    properties.flatten().map(|(name, schema)| (name.clone(), schema.clone())).collect()
+    let own = properties.flatten().map(|(name, schema)| (name.clone(), schema.clone()));
+    own.chain([("prior".to_owned(), Value::Null)]).collect()
 }
 
 fn known_field(known: &Fields, field: &str) -> Result<(), String> {

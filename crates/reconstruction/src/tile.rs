@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_is_shared_than_was_asked_for() {
+    fn the_overlap_is_not_larger_than_requested() {
         for (length, size, overlap, count, side) in
             [(1024, 256, 32, 5, 232), (3200, 256, 32, 15, 248), (3200, 384, 16, 9, 376)]
         {

@@ -196,7 +196,7 @@ impl Tile {
         let [count, height, width] = self.shape;
         let size = (height.div_ceil(16), width.div_ceil(16));
         let record = json!({
-            "tv_iterations": 3, "denoiser_passes": 0, "stop_reason": "max-iterations",
+            "iterations": 3, "tv_iterations": 3, "denoiser_passes": 0, "stop_reason": "max-iterations",
             "residual": residual(&self.masks, frames, &self.snapshot), "solved": [0],
             "assessment": {"size": [size.0, size.1], "motion": 0.5, "unfamiliar": false,
                 "levels": "40".repeat(count * size.0 * size.1)},
@@ -295,6 +295,7 @@ fn lies() -> Vec<Lie> {
         field("cpu_seconds", "/done/record/cpu_seconds", json!(1e300)),
         field("cpu_seconds", "/done/record/cpu_seconds", json!(-1.0)),
         field("peak_rss_bytes", "/done/record/peak_rss_bytes", json!(u64::MAX)),
+        field("iterations", "/done/record/iterations", json!(4_000_000)),
         field("tv_iterations", "/done/record/tv_iterations", json!(4_000_000)),
         field("stop_reason", "/done/record/stop_reason", json!("<b>bored</b>")),
         field("solved", "/done/record/solved", json!([7])),

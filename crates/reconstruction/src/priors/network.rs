@@ -178,9 +178,9 @@ impl Encoder for ClipEncoder {
         // Several frames at once would multiply the memory.
         let each = (1, CHANNELS * rows * columns);
         run_chunked(network, (input, output), padded, each, ENCODER_SIGMA)?;
-        let seen = ArrayView4::from_shape((count, CHANNELS, rows, columns), output)
+        let features = ArrayView4::from_shape((count, CHANNELS, rows, columns), output)
             .map_err(|error| ReconError::Runtime(error.to_string()))?;
-        Ok(seen.permuted_axes([1, 0, 2, 3]).as_standard_layout().into_owned())
+        Ok(features.permuted_axes([1, 0, 2, 3]).as_standard_layout().into_owned())
     }
 }
 
@@ -228,9 +228,9 @@ fn run_chunked(
     sigma: f32,
 ) -> Result<()> {
     let plane = rows * columns;
-    let beside = input.len() / plane - output.len() / values;
+    let margins = input.len() / plane - output.len() / values;
     for (index, output) in output.chunks_mut(chunk * values).enumerate() {
-        let count = output.len() / values + beside;
+        let count = output.len() / values + margins;
         let frames = &input[index * chunk * plane..][..count * plane];
         let frames = ArrayView4::from_shape((count, 1, rows, columns), frames)
             .map_err(|error| ReconError::Runtime(error.to_string()))?;
@@ -255,8 +255,8 @@ mod tests {
 
     #[test]
     fn reflection_mirrors_without_repeating_the_ends() {
-        let seen: Vec<usize> = (-3..7).map(|index| reflect(index, 4)).collect();
-        assert_eq!(seen, [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
+        let reflected: Vec<usize> = (-3..7).map(|index| reflect(index, 4)).collect();
+        assert_eq!(reflected, [3, 2, 1, 0, 1, 2, 3, 2, 1, 0]);
         assert_eq!((reflect(-2, 1), reflect(5, 1)), (0, 0));
         assert_eq!((reflect(-2, 2), reflect(2, 2)), (0, 0));
     }

@@ -136,6 +136,7 @@ pub struct Nonlocal {
     frames: usize,
     height: usize,
     width: usize,
+    /// Number of calls of [`Nonlocal::denoise`].
     passes: usize,
     /// The input clip. All clips here have a margin to the right and below, so that a search reads whole vectors and blocks
     /// of rows.
@@ -411,7 +412,7 @@ mod tests {
             let mut prior = Nonlocal::new(size);
             prior.denoise(&mut video, 0.1, 0.0);
             let after = mean_square(&video, &clean);
-            // A handful of patches tells little.
+            // A handful of patches removes little noise.
             let least = if size.1 < 10 { 1.0 } else { 0.25 };
             assert!(after < least * before, "{size:?}: {before} to {after}");
         }
@@ -573,7 +574,7 @@ mod tests {
         }
     }
 
-    /// All vector instructions give the same, bit by bit, but for those without fused multiplication.
+    /// All vector instructions with fused multiplication give the same bits.
     #[test]
     fn vector_instructions_do_not_matter() {
         let size = (4, 27, 38);
@@ -593,9 +594,9 @@ mod tests {
         }
     }
 
-    /// Texture that moves by more than a window reaches in two frames, and never comes back.
+    /// Texture that moves out of the search window within two frames, and does not repeat.
     #[test]
-    fn patches_are_found_where_they_move_to() {
+    fn patches_are_found_along_their_motion() {
         let size = (6, 72, 96);
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(6);
         let fine = Array2::from_shape_fn((120, 120), |_| rng.random::<f32>());

@@ -154,7 +154,7 @@ pub(super) mod tests {
     fn changes_are_those_of_the_reference() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2);
         for (size, margin) in [((7, 9, 13), 0), ((2, 3, 4), 5), ((1, 6, 6), 1), ((5, 1, 2), 3)] {
-            // Much motion to the left, none to the right, below the level and above it.
+            // The changes fall from left to right, from far above the level to below it.
             let clip = Array3::from_shape_fn(size, |(_, _, j)| {
                 let noise = rng.random::<f32>();
                 0.5 + noise / (1 + 3 * j) as f32
@@ -175,16 +175,16 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_is_far_above_the_level_stays_and_what_is_far_below_goes() {
+    fn coefficients_far_above_the_level_stay_and_those_far_below_vanish() {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(4);
         let clip = Array3::from_shape_simple_fn((6, 12, 12), || rng.random::<f32>());
-        for (level, left) in [(1e-3, 1.0), (30.0, 0.0), (f32::MIN_POSITIVE, 1.0)] {
+        for (level, share) in [(1e-3, 1.0), (30.0, 0.0), (f32::MIN_POSITIVE, 1.0)] {
             let mut flat = clip.clone().into_raw_vec_and_offset().0;
             TemporalShrinkage::new(clip.dim()).shrink(&mut flat, 12, level);
             let found = Array3::from_shape_vec(clip.dim(), flat).unwrap();
             let mean = clip.mean_axis(Axis(0)).unwrap();
             for (found, clip) in found.outer_iter().zip(clip.outer_iter()) {
-                let expected = &mean + &(left * (&clip - &mean));
+                let expected = &mean + &(share * (&clip - &mean));
                 assert!((&found - &expected).iter().all(|d| d.abs() < 1e-4), "{level}");
             }
         }

@@ -216,6 +216,7 @@ impl Known {
         let fields = [
             ("progress", is_possible(progress) && progress.iterations as usize <= most),
             ("passes", progress.passes as usize <= most * pieces.len().max(1)),
+            ("iterations", tile.iterations <= most),
             ("tv_iterations", tile.tv_iterations <= most),
             ("denoiser_passes", tile.denoiser_passes <= most),
             ("residual", tile.residual.is_finite() && tile.residual >= 0.0),
