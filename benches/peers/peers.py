@@ -154,7 +154,7 @@ def whole_job(binary, size=256, frames=8):
                 (folder / 'schedule.json').write_text(json.dumps(schedule))
                 arguments += ['--schedule', folder / 'schedule.json']
             report = run('reconstruct', *files, *arguments)
-            return {'what': what, 'cpu_s': round(report['cpu_seconds'], 1), 'psnr_db': round(report['psnr_db'], 2)}
+            return {'what': what, 'cpu_s': round(report['cpu_seconds'], 1), 'psnr_db': round(report['psnr_unit_db'], 2)}
 
         default = run('schedule', '--algorithm', 'pnp-tv-fastdvdnet')
         parts = [stage for stage in default['stages'] if stage['prior'] == 'tv' or stage['prior'].startswith('fastdvdnet')]

@@ -58,7 +58,7 @@ def main():
                 run("simulate", "--frames", folder / frames, *mosaic, "--compression-ratio", FRAMES, "--pattern", pattern,
                     "--seed", 1, "--out", made)
                 files = [f"--{what}={made / what}.npy" for what in ["masks", "measurement", "truth"]]
-                psnr = [json.loads(run("reconstruct", *files, *mosaic, "--algorithm", algorithm, "--json"))["psnr_db"]
+                psnr = [json.loads(run("reconstruct", *files, *mosaic, "--algorithm", algorithm, "--json"))["psnr_unit_db"]
                         for algorithm in ALGORITHMS]
                 row += [*psnr, psnr[1] - psnr[0]]
             print(f"| {name} | {pattern} | " + " | ".join(f"{value:.2f}" for value in row) + " |", flush=True)

@@ -363,7 +363,7 @@ class Rows:
             report = json.loads(self.program.run('reconstruct', *inputs, *way.arguments, '--threads', 1, '--json'))
         assessment = report['assessment'] or {}
         row = {'scene': str(setting), 'masks': setting.kind(), 'cr': setting.cr, 'sigma': setting.sigma, 'half': setting.half, 'algorithm': name,
-               'psnr_db': round(report['psnr_db'], 2), 'ssim': round(report['ssim'], 4), 'passes': report['denoiser_passes'],
+               'psnr_db': round(report['psnr_unit_db'], 2), 'psnr_white_db': round(report['psnr_db'], 2), 'ssim': round(report['ssim'], 4), 'passes': report['denoiser_passes'],
                'cpu_seconds': round(report['cpu_seconds'], 1), 'predicted': [assessment.get(end) for end in ('psnr_low_db', 'psnr_db', 'psnr_high_db')], 'models': {m['name']: m['sha256'] for m in way.models}}
         with open(path + '.part', 'w') as f:
             json.dump(row, f)
@@ -438,7 +438,7 @@ def predictions(rows):
     for what, of in groups.items():
         known = [r for r in of if None not in r['predicted']]
         if known:
-            predicted, true = np.array([r['predicted'] for r in known]), np.minimum([r['psnr_db'] for r in known], BEST)
+            predicted, true = np.array([r['predicted'] for r in known]), np.minimum([r['psnr_white_db'] for r in known], BEST)
             yield {'what': what, **accuracy(true - predicted[:, 1], (predicted[:, 0] <= true) & (true <= predicted[:, 2])), 'untold': len(of) - len(known)}
 
 

@@ -59,7 +59,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let file = file.map_err(FormatError::io("write masks.npy"))?;
         npy::writer(BufWriter::new(file), (info.frames, info.height, info.width), Channels::Grey)
     };
-    let calibrated = calibrate(&files, &Limits::default(), scratch.path(), masks, &mut share);
+    let calibrated =
+        calibrate((&files, None), &Limits::default(), scratch.path(), masks, &mut share);
     let (calibrated, _) = calibrated.map_err(|error| match error.is_retryable() {
         // Includes failures to write.
         true => CliError::Failure(error.to_string()),

@@ -20,16 +20,19 @@ use super::output::print_line;
 use super::progress::SnapshotBar;
 use super::verdict;
 use crate::cli::error::Result;
-use engine::intake::{self, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth};
+use engine::intake::{
+    self, Behind, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth,
+};
 use engine::job::{
-    Algorithm, Assessment, Finding, Mosaic, SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
+    Algorithm, Assessment, Finding, MaskOrder, Mosaic, SceneShape, Schedule, Sequence, Sha256,
+    keeps_mosaic,
 };
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
 use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
-use engine::pipeline::scale::white;
+use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{check_output, replace_result, write_result};
@@ -65,7 +68,10 @@ pub struct Arguments {
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE")]
     dark: Vec<PathBuf>,
-    /// The stored number at and above which a pixel is saturated [default: the largest of its type].
+    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
+    #[arg(long, value_name = "FILE")]
+    bad_pixels: Option<PathBuf>,
+    /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
     #[arg(long, value_name = "NUMBER")]
     saturation: Option<u32>,
     /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
@@ -169,7 +175,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         (arguments.sequence, snapshots.len() as u32),
         dim,
     )?;
-    let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots)?);
+    let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots.clone())?);
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let threads = arguments.threads.map_or(cores, usize::from);
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
@@ -217,7 +223,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         Quality::compare(frame, truth.view(), *channels)
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
-    let recipe = input.recipe(&setup, white, &solved)?;
+    let mut histogram = Histogram::default();
+    (0..frames * snapshots.len()).for_each(|index| histogram.add(&solved_frame(index)));
+    let white_level = white_level(&histogram, white);
+    let recipe = input.recipe(&setup, (white, white_level), &solved)?;
     let expected = |snapshot| {
         let assessments = solved.assessments(&sequence, snapshot, &recipe.schedule);
         recipe.expected(snapshot, &assessments)
@@ -321,7 +330,7 @@ struct Input<'a> {
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let mut sources = Sources::new(arguments)?;
-        let masks = read_masks(&sources.masks)?;
+        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
         if let Some(truth) = &mut sources.truth {
@@ -330,7 +339,10 @@ impl<'a> Input<'a> {
         let Snapshots { first, last } = arguments.snapshots;
         let Arguments { dark, saturation, .. } = arguments;
         let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
-        let read = read_snapshots(&sources.measurement, &exposure, (first, last))?;
+        let behind =
+            Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
+        masks.array.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
+        let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))?;
         let (measurement, snapshots) = (read.measurement, read.count);
         let (count, rows, columns) = measurement.array.dim();
         if (rows, columns) != (height, width) {
@@ -363,13 +375,13 @@ impl<'a> Input<'a> {
         };
         let has_dark = !dark.is_empty();
         let arrays = (masks.array.view(), measurement.array.view());
-        let mut findings = read.passed.findings;
-        let judged = judge(arrays, mosaic, read.passed.saturated.as_deref(), has_dark)?;
-        findings.extend(judged.into_iter().map(|finding| {
+        let judged = judge(arrays, mosaic, has_dark)?;
+        let judged = judged.into_iter().map(|finding| {
             // Findings count from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
             Finding { snapshot, ..finding }
-        }));
+        });
+        let findings = intake::combined(read.passed.findings, judged.collect());
         Ok(Self { sources, masks, measurement, first, truth, mosaic, findings })
     }
 
@@ -384,12 +396,17 @@ impl<'a> Input<'a> {
         self.first..self.first + self.measurement.array.dim().0
     }
 
-    /// The common white level of all snapshots, as in a job.
+    /// The solver's common scale of all snapshots, as in a job.
     fn white(&self) -> Result<f32> {
         Ok(white(self.masks.array.view(), self.measurement.array.view())?)
     }
 
-    fn recipe(&self, setup: &Setup, white: f32, solved: &Solved) -> Result<Recipe> {
+    fn recipe(
+        &self,
+        setup: &Setup,
+        (normalisation, white_level): (f32, f32),
+        solved: &Solved,
+    ) -> Result<Recipe> {
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule)?;
         models.extend(setup.model.as_ref().map(Model::record));
@@ -409,7 +426,8 @@ impl<'a> Input<'a> {
             scale: ScaleRecord {
                 masks_full_scale: self.masks.full_scale,
                 measurement_full_scale: self.measurement.full_scale,
-                white,
+                normalisation,
+                white_level,
             },
             tile_plan: setup.plan.clone(),
             runs: setup.runs.clone(),
@@ -424,13 +442,12 @@ impl<'a> Input<'a> {
 fn judge(
     (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
     mosaic: Option<Mosaic>,
-    saturated: Option<&[f64]>,
     has_dark: bool,
 ) -> Result<Vec<Finding>> {
     let limits = Limits::default();
     let prepared = [prepare(masks)?, prepare(snapshots)?];
     let paths = (prepared[0].path(), prepared[1].path());
-    let mut findings = intake::judge(paths, mosaic, saturated, has_dark, &limits)?;
+    let mut findings = intake::judge(paths, mosaic, has_dark, &limits)?;
     let report = intake::report(&planar::Reader::open(paths.0, &limits)?, &mut |_| true)?;
     findings.extend(report.report.warning());
     Ok(findings)
@@ -470,7 +487,12 @@ struct Report {
     frames: usize,
     height: usize,
     width: usize,
+    /// PSNR relative to the white level, as the expected one.
     psnr_db: Option<f64>,
+    /// PSNR for a data range of 1, as benchmarks state it.
+    psnr_unit_db: Option<f64>,
+    /// The 99.9th percentile of all frames.
+    white_level: f32,
     /// The predicted quality of the frames, as a mean over the snapshots.
     assessment: Option<Assessment>,
     /// PSNR of each snapshot. Empty if the truth is unknown.
@@ -506,6 +528,9 @@ impl Report {
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
         let summary = Summary::of(&tiles);
+        let white_level = recipe.scale.white_level;
+        let psnr_unit_db = quality.as_ref().map(|quality| quality.psnr);
+        let quality = quality.map(|quality| quality.relative_to(white_level));
         let by_frame = quality.as_ref().map_or(&[][..], |quality| &quality.frames);
         let mean = |frames: &[FrameQuality]| {
             frames.iter().map(|frame| frame.psnr).sum::<f64>() / frames.len() as f64
@@ -517,6 +542,8 @@ impl Report {
             height,
             width,
             psnr_db: quality.as_ref().map(|quality| quality.psnr),
+            psnr_unit_db,
+            white_level,
             assessment: None,
             psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
             ssim: quality.as_ref().and_then(|quality| quality.ssim),
@@ -555,6 +582,9 @@ impl Report {
             self.stop_reason
         ))?;
         print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
+        if self.assessment.as_ref().and_then(|one| one.order) == Some(MaskOrder::NotVerifiable) {
+            print_line("order of masks not verifiable: the scene moves too little or too fast")?;
+        }
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(
@@ -580,9 +610,12 @@ impl Report {
                 error(joint.error_together),
             ))?;
         }
-        if let Some(psnr) = self.psnr_db {
+        if let (Some(psnr), Some(unit)) = (self.psnr_db, self.psnr_unit_db) {
             let ssim = self.ssim.map_or_else(String::new, |ssim| format!(", SSIM {ssim:.4}"));
-            print_line(format!("PSNR {psnr:.2} dB{ssim}"))?;
+            print_line(format!(
+                "PSNR {psnr:.2} dB relative to the white level {:.4} ({unit:.2} dB for a data range of 1){ssim}",
+                self.white_level
+            ))?;
         }
         if let Some(out) = &arguments.out {
             print_line(format!("frames are in {}", out.display()))?;

@@ -48,6 +48,9 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
           help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
+    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
+    #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
+    bad_pixels: Option<PathBuf>,
     /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas].
     #[arg(long, value_name = "NAME", help_heading = MEASUREMENT)]
     array: Option<String>,
@@ -63,7 +66,7 @@ pub(super) struct SubmissionArguments {
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE", help_heading = MEASUREMENT)]
     dark: Vec<PathBuf>,
-    /// The stored number at and above which a pixel is saturated [default: the largest of its type].
+    /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
     #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
     saturation: Option<u32>,
     /// The stored number in the snapshots that means 1 [default: that of their type].
@@ -121,9 +124,9 @@ pub(super) struct Recipe {
 }
 
 impl SubmissionArguments {
-    /// Files that belong to each snapshot: the masks and the dark captures.
+    /// Files that belong to each snapshot: the masks, the map of bad pixels and the dark captures.
     pub(super) fn own_files(&self) -> impl Iterator<Item = &PathBuf> {
-        self.masks.iter().chain(&self.dark)
+        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark)
     }
 
     /// Uploads masks and dark captures, creates the calibration if necessary, and returns the requests.
@@ -132,7 +135,12 @@ impl SubmissionArguments {
         let calibration = match (&self.calibration, &self.masks) {
             (Some(id), _) => id.to_string(),
             (None, Some(masks)) => {
-                let body = self.calibration_request(client.upload_with_bar(masks).await?);
+                let bad_pixels = match &self.bad_pixels {
+                    Some(map) => Some(client.upload_with_bar(map).await?),
+                    None => None,
+                };
+                let body =
+                    self.calibration_request(client.upload_with_bar(masks).await?, bad_pixels);
                 // One file of masks creates one calibration for all clients.
                 let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
                 client.create_checked("/v1/calibrations", &body, &key).await?
@@ -156,7 +164,7 @@ impl SubmissionArguments {
         Ok(sent)
     }
 
-    fn calibration_request(&self, masks: Sha256) -> Value {
+    fn calibration_request(&self, masks: Sha256, bad_pixels: Option<Sha256>) -> Value {
         let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
         add(&mut body, "array", json!(self.masks_array));
         add(&mut body, "axes", json!(self.masks_axes));
@@ -165,6 +173,7 @@ impl SubmissionArguments {
         add(&mut body, "packing", json!(self.masks_packing));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         add(&mut body, "mosaic", json!(self.mosaic));
+        add(&mut body, "bad_pixels", json!(bad_pixels));
         add(&mut body, "name", json!(self.masks_name));
         Value::Object(body)
     }
@@ -286,6 +295,7 @@ mod tests {
             ("masks-full-scale", "255"),
             ("masks-name", "May"),
             ("mosaic", "rggb"),
+            ("bad-pixels", "b.npy"),
             ("array", "meas"),
             ("axes", "row-column-frame"),
             ("crop", "0,8,64,64"),
@@ -319,7 +329,7 @@ mod tests {
         let arguments = SubmissionArguments::from_arg_matches(&matches).unwrap();
 
         let sha256 = Sha256::of(b"file");
-        let calibration = arguments.calibration_request(sha256);
+        let calibration = arguments.calibration_request(sha256, Some(sha256));
         // Captures of many files are for `calibrate`, the dashboard and the client libraries.
         let expected = properties("CalibrationRequest", &["captures"]);
         assert_eq!(names(calibration.as_object().unwrap()), expected);

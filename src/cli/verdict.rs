@@ -50,10 +50,20 @@ fn line(finding: &Finding, snapshots: &[u32]) -> String {
 /// The grade, with the expected PSNR if it can be predicted.
 pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> String {
     match assessment {
-        Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, .. }) => format!(
-            "{}, expected PSNR {psnr_db:.1} dB ({psnr_low_db:.1} to {psnr_high_db:.1})",
-            grade.into_str()
-        ),
+        Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, .. }) => {
+            let grade = grade.into_str();
+            let best = Assessment::MAX_PSNR_DB;
+            match (psnr_db, psnr_low_db, psnr_high_db) {
+                (Some(psnr), Some(low), Some(high)) if *psnr < best => {
+                    format!("{grade}, expected PSNR {psnr:.1} dB ({low:.1} to {high:.1})")
+                }
+                (Some(_), Some(low), _) if *low < best => {
+                    format!("{grade}, expected PSNR {best:.0} dB or more ({low:.1} or more)")
+                }
+                (Some(_), ..) => format!("{grade}, expected PSNR {best:.0} dB or more"),
+                (None, ..) => format!("{grade}, no expected PSNR"),
+            }
+        }
         None if errors(findings) > 0 => "bad".to_owned(),
         None => "not assessed".to_owned(),
     }
@@ -150,13 +160,25 @@ mod tests {
     fn a_verdict_has_the_grade_and_the_expected_psnr() {
         let assessment = Assessment {
             grade: Grade::Usable,
-            psnr_db: 31.24,
-            psnr_low_db: 29.8,
-            psnr_high_db: 32.9,
+            psnr_db: Some(31.24),
+            psnr_low_db: Some(29.8),
+            psnr_high_db: Some(32.9),
+            order: None,
             reasons: Vec::new(),
         };
         let text = verdict(Some(&assessment), &[]);
         assert_eq!(text, "usable, expected PSNR 31.2 dB (29.8 to 32.9)");
+        let at = |psnr, low| Assessment {
+            psnr_db: Some(psnr),
+            psnr_low_db: Some(low),
+            psnr_high_db: Some(40.0),
+            ..assessment.clone()
+        };
+        let capped = verdict(Some(&at(40.0, 38.2)), &[]);
+        assert_eq!(capped, "usable, expected PSNR 40 dB or more (38.2 or more)");
+        assert_eq!(verdict(Some(&at(40.0, 40.0)), &[]), "usable, expected PSNR 40 dB or more");
+        let withheld = Assessment { psnr_db: None, ..assessment };
+        assert_eq!(verdict(Some(&withheld), &[]), "usable, no expected PSNR");
         assert_eq!(verdict(None, &[]), "not assessed");
         assert_eq!(verdict(None, &[finding("a", Severity::Error, None)]), "bad");
     }

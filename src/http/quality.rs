@@ -12,7 +12,7 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
-use super::results::result_file;
+use super::results::{result_file, white_level};
 use engine::intake::{Opened, Source};
 use engine::job::{JobId, SceneShape, Sha256};
 use engine::pipeline::quality::{FrameQuality, Quality};
@@ -31,6 +31,8 @@ pub(super) struct QualityQuery {
 #[schemars(rename = "QualityReport")]
 pub(super) struct QualityBody {
     truth: Sha256,
+    /// Value to which the PSNR is relative: the job's white level, as for the expected PSNR.
+    peak: f32,
     #[serde(flatten)]
     quality: Quality,
 }
@@ -58,7 +60,9 @@ pub(super) async fn show(
         let truth = truth.arranged(query.axes, Some((shape.height, shape.width)));
         compare((&path, Channels::Grey), truth.open()?, snapshot as usize, shape)
     });
-    conditional::json(&QualityBody { truth, quality: frames.await?.into() }, &headers)
+    let quality: Quality = frames.await?.into();
+    let peak = white_level(&app, id).await?.unwrap_or(1.0);
+    conditional::json(&QualityBody { truth, peak, quality: quality.relative_to(peak) }, &headers)
 }
 
 /// Compares the frames of a snapshot with those of a truth that has the frames of this snapshot, or

@@ -14,6 +14,7 @@ use super::extract::{Caller, Params, QueryOf};
 use super::jobs::with_snapshot;
 use super::page::{Cursor, Limit, PageBody};
 use engine::job::{JobId, JobState, ResultFile};
+use engine::pipeline::records::WhiteRecord;
 use store::{Job, Page, StoreError};
 
 /// A snapshot of a job, with its files.
@@ -188,6 +189,14 @@ pub(super) fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String
         Some(snapshot) => format!("filename=\"{short}_{snapshot:04}_{file}\""),
         None => format!("filename=\"{short}_{file}\""),
     }
+}
+
+/// The white level of a job's frames; `None` before it is determined.
+pub(in crate::http) async fn white_level(app: &App, job: JobId) -> Result<Option<f32>> {
+    let record = app.store.white_record(job).await?;
+    let read = |record| serde_json::from_value::<WhiteRecord>(record);
+    let record = record.map(read).transpose().map_err(|error| ApiError::internal(&error))?;
+    Ok(record.map(|record| record.white_level))
 }
 
 #[cfg(test)]

@@ -10,7 +10,9 @@ use crate::samples::Scene;
 #[tokio::test]
 async fn a_result_has_an_expected_psnr_and_an_error_map() {
     let app = TestApp::with(&["--workers", "1"]).await;
-    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // Of fewer masks too many pixels are closed, which puts the calibration in doubt.
+    let scene = Scene { frames: 10, ..Scene::SMALL };
+    let (_, measurement) = app.scene(&scene).await;
     // Two tiles, so that their error maps are joined.
     let wanted = json!({"measurement": measurement, "algorithm": "gap-tv", "tile": {"size": 32, "overlap": 8}});
     let job = app.submit(&wanted).await;
@@ -39,7 +41,7 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
     let base = format!("/v1/jobs/{job}/snapshots/0");
     let manifest = app.get(&format!("{base}/exports/manifest")).await.expect(200).json();
     assert_eq!(manifest["content"]["assessment"], snapshots[0]["assessment"]);
-    let Scene { frames, height, width, .. } = Scene::SMALL;
+    let Scene { frames, height, width, .. } = scene;
     let blocks = (height.div_ceil(16), width.div_ceil(16));
     let array = app.get(&format!("{base}/exports/error")).await.expect(200).bytes;
     let header = String::from_utf8_lossy(&array[..128]).into_owned();
@@ -60,8 +62,8 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
         (spread["height"].as_u64(), spread["width"].as_u64()),
         (Some(height as u64), Some(width as u64))
     );
-    let picture = format!("{base}/pictures/error-2/tiles/0/0/0?black=0&white=0.5")
-        .replace("/v1/", "/view/");
+    let picture =
+        format!("{base}/pictures/error-2/tiles/0/0/0?black=0&white=0.5").replace("/v1/", "/view/");
     let (_, columns, shown) = decode(&app.get(&picture).await.expect(200));
     let second = &values[blocks.0 * blocks.1..];
     for (row, column) in [(0, 0), (17, 3), (height - 1, width - 1)] {

@@ -47,8 +47,8 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     let job_manifest =
         app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
     assert_eq!(job_manifest["content"]["snapshots"][0]["summary"], content["summary"]);
-    // The tasks are prepare, preview, six tiles, assemble and manifest.
-    assert_eq!(job_manifest["run"]["tasks"], 10);
+    // The tasks are prepare, preview, six tiles, white level, assemble and manifest.
+    assert_eq!(job_manifest["run"]["tasks"], 11);
 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

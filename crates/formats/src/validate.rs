@@ -29,7 +29,8 @@ struct Located {
     column: usize,
 }
 
-/// Reads all masks, passes each one (row, column) on `[0,1]` to `sink`, and returns the statistics.
+/// Reads all masks, passes each one (row, column) on `[0,1]` to `sink`, and returns the statistics. NaN are not measured and
+/// stay NaN.
 ///
 /// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]. After the last mask, so that the message
 /// can contain the largest value: [`FormatError::BipolarMasks`], [`FormatError::AboveFullScale`],
@@ -52,7 +53,7 @@ pub fn check_masks(
         for ((row, mut values), mut open) in
             mask.rows_mut().into_iter().enumerate().zip(open.rows_mut())
         {
-            if let Some(column) = values.iter().position(|value| !value.is_finite()) {
+            if let Some(column) = values.iter().position(|value| value.is_infinite()) {
                 return Err(not_finite("masks", values[column], frames, row, column));
             }
             let row_max = values.iter().fold(0f32, |max, value| max.max(*value));
@@ -68,7 +69,7 @@ pub fn check_masks(
                 // Values above 1 by more than rounding are refused at the end.
                 *value = scaled.clamp(0.0, 1.0);
                 *open |= *value * *value > 0.0;
-                sum += f64::from(*value);
+                sum += if value.is_nan() { 0.0 } else { f64::from(*value) };
             }
         }
         if frame_max == 0.0 {
@@ -165,36 +166,42 @@ impl Side {
 }
 
 /// Reads all snapshots, and passes each one (row, column) divided by the full scale to `sink`. Values may have any
-/// sign.
+/// sign; NaN are not measured and stay NaN. Returns the snapshots that are 0 everywhere.
 ///
-/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::SnapshotZero`]. After an
-/// error the output of the sink is invalid.
+/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::SnapshotZero`] if all are 0.
+/// After an error the output of the sink is invalid.
 pub fn check_snapshots(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
     mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<()>,
-) -> Result<()> {
+) -> Result<Vec<usize>> {
     let (info, scale) = (*reader.info(), full_scale.value());
-    let mut snapshots = 0;
+    let (mut snapshots, mut zero) = (0, Vec::new());
     while let Some(mut snapshot) = reader.next_frame()? {
         check_size(&info, snapshots, &snapshot)?;
         let mut has_signal = false;
         for ((row, column), value) in snapshot.indexed_iter_mut() {
             let scaled = *value / scale;
             // A small full scale may turn a finite value into an infinity.
-            if !scaled.is_finite() {
+            if scaled.is_infinite() {
                 return Err(not_finite("measurement", *value, snapshots, row, column));
             }
-            has_signal |= scaled != 0.0;
+            has_signal |= scaled != 0.0 && !scaled.is_nan();
             *value = scaled;
         }
         if !has_signal {
-            return Err(FormatError::SnapshotZero { snapshot: snapshots, snapshots: info.frames });
+            zero.push(snapshots);
         }
         snapshots += 1;
         sink(snapshot.view())?;
     }
-    check_count(info.frames, snapshots)
+    check_count(info.frames, snapshots)?;
+    match zero.first() {
+        Some(&snapshot) if zero.len() == snapshots => {
+            Err(FormatError::SnapshotZero { snapshot, snapshots })
+        }
+        _ => Ok(zero),
+    }
 }
 
 fn not_finite(

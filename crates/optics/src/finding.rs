@@ -60,6 +60,8 @@ pub enum FindingCode {
     LightDrift,
     BadCalibration,
     Saturated,
+    BadPixels,
+    EmptySnapshot,
     LeftAligned,
     RightAligned,
     Level,
@@ -69,11 +71,15 @@ pub enum FindingCode {
     NegativeOffset,
     Mosaic,
     ShiftedMasks,
+    DriftedMasks,
+    TurnedMasks,
     ForeignMasks,
     FastMotion,
     UnfamiliarMasks,
     UnevenError,
     NoTileWorkers,
+    UnexplainedPixels,
+    ExchangedMasks,
 }
 
 /// The description of a [`FindingCode`].
@@ -242,7 +248,21 @@ impl FindingCode {
                 Warning,
                 Error,
                 "pixels are saturated",
-                "reduce the exposure time or stop down the lens",
+                "reduce the exposure time or stop down the lens; if the value is a valid reading, state a higher `saturation`",
+            ),
+            Self::BadPixels => (
+                &[Measurement],
+                Warning,
+                Error,
+                "pixels are hot, dead, or marked as not measured",
+                "nothing, if there are few; name a map of the sensor's bad pixels as `bad_pixels` of the calibration",
+            ),
+            Self::EmptySnapshot => (
+                &[Measurement],
+                Warning,
+                Warning,
+                "a snapshot is 0 everywhere",
+                "check the trigger of the camera; the frames of this snapshot are black",
             ),
             Self::LeftAligned => (
                 &[Measurement],
@@ -309,6 +329,21 @@ impl FindingCode {
                 "the masks fit better when shifted (by up to 4 pixels)",
                 "the optics moved since the calibration: calibrate again",
             ),
+            Self::DriftedMasks => (
+                &[Measurement],
+                Warning,
+                Warning,
+                "the masks are displaced by a fraction of a pixel",
+                "calibrate again once the optics are stable; if the finding stays, record dark frames and name them as `dark`",
+            ),
+            Self::TurnedMasks => (
+                &[Measurement],
+                Error,
+                Error,
+                "the masks fit when they are flipped or their rows and columns exchanged",
+                "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
+                 calibration again",
+            ),
             Self::ForeignMasks => (
                 &[Measurement],
                 Error,
@@ -344,6 +379,21 @@ impl FindingCode {
                 "no worker takes tiles, so the job makes no progress",
                 "ask the administrator to start workers: `serve --workers N` on the machine of the service, or \
                  `sci-recon worker` on another one",
+            ),
+            Self::ExchangedMasks => (
+                &[Result],
+                Error,
+                Error,
+                "two masks are probably exchanged",
+                "check that the masks are in the order in which the LCoS shows the patterns during a measurement",
+            ),
+            Self::UnexplainedPixels => (
+                &[Result],
+                Error,
+                Error,
+                "the frames do not predict pixels that were withheld from the reconstruction",
+                "check that the masks belong to this measurement, unflipped and in its pixel grid, and that the \
+                 measurement is not mostly noise; then calibrate again",
             ),
         };
         Entry { subjects, severity, worst, title, remedy }

@@ -22,6 +22,14 @@ const SHIFT_SIGNIFICANCE: f64 = 30.0;
 /// Simulated grey scenes behind masks of single pixels stay below 0.007 and 3.
 const MOSAIC_AMPLITUDE: f64 = 0.02;
 const MOSAIC_SIGNIFICANCE: f64 = 8.0;
+/// A mosaic is also reported if the colours of neighbouring blocks agree by this share of the mean, and by this many
+/// standard errors: colours that cancel over the picture do so.
+const LOCAL_MOSAIC_AMPLITUDE: f64 = 0.03;
+const LOCAL_MOSAIC_SIGNIFICANCE: f64 = 5.0;
+/// Largest energy of the difference between the two green phases, relative to that of the other differences.
+const MAX_GREEN_DIFFERENCE: f64 = 0.25;
+/// A drift is reported if the masks are displaced by at least this many pixels.
+const MIN_DRIFT: f64 = 0.12;
 /// Offsets below this share of the mean are not reported.
 const OFFSET_SHARE: f64 = 0.03;
 /// A block counts as negative if its mean is below minus this share of the mean of the measurement. The noise of a
@@ -67,6 +75,10 @@ struct Strip {
     y_phases: [f64; 4],
     /// Phase means of each mask \[B,4\], defined like `y_phases`.
     mask_phases: Vec<[f64; 4]>,
+    /// Phase means of the measurement in each block \[n,4\].
+    y_block_phases: Vec<[f64; 4]>,
+    /// Phase means of each mask in each block \[B,n,4\].
+    mask_block_phases: Vec<Vec<[f64; 4]>>,
 }
 
 /// Weighted least-squares fit of the brightness of each frame, and of the offset.
@@ -103,6 +115,10 @@ pub struct MeasurementFigures {
     pub shift_significance: f64,
     /// Largest difference between pixels of even and odd rows and columns that the masks do not explain.
     pub mosaic: PhaseDifference,
+    /// Difference between the colours of a mosaic on which neighbouring blocks agree.
+    pub local_mosaic: PhaseDifference,
+    /// Displacement (rows, columns) of the masks by less than a pixel that the measurement indicates.
+    pub drift: (f64, f64),
 }
 
 /// A difference between the four phases (row, column) modulo 2 of a sensor's pixels.
@@ -192,6 +208,14 @@ impl MeasurementStudy {
         let negative_area = (negative_blocks * BLOCK * BLOCK) as f64 / self.pixels;
         let pixels_from_centre = |index: usize| REACH as i32 - index as i32;
         let mosaic = phase_difference(&self.strips, &fit.brightness, mean);
+        let local_mosaic = local_phase_difference(&self.strips, &fit.brightness);
+        let centre = REACH * (2 * REACH + 1) + REACH;
+        let at = |index: usize| explained(&self.correlations[index]).max(0.0).sqrt();
+        let drift_along = |step: usize| {
+            let (before, after) = (at(centre - step), at(centre + step));
+            (before - after) / (before.max(after) + at(centre)).max(1e-9)
+        };
+        let drift = (drift_along(2 * REACH + 1), drift_along(1));
         let brightness = fit.brightness.to_vec();
         // The weights are for the offset only: `brightness` describes the whole scene, so all blocks count equally.
         let mut weighted = fit;
@@ -207,6 +231,8 @@ impl MeasurementStudy {
             brightness,
             uncertainty,
             mosaic,
+            local_mosaic,
+            drift,
             shift: (pixels_from_centre(row), pixels_from_centre(column)),
             explained: explained_shifted,
             explained_unshifted: unshifted,
@@ -302,6 +328,8 @@ impl Strip {
             mask_means,
             y_phases: phases(y),
             mask_phases: masks.outer_iter().map(phases).collect(),
+            y_block_phases: block_phases(y),
+            mask_block_phases: masks.outer_iter().map(block_phases).collect(),
         }
     }
 
@@ -343,6 +371,62 @@ fn phases(image: ArrayView2<'_, f32>) -> [f64; 4] {
     };
     let means = [0, 1, 2, 3].map(mean);
     means.map(|value| value - means.iter().sum::<f64>() / 4.0)
+}
+
+/// Phase means of each block of a strip, as [`phases`].
+fn block_phases(strip: ArrayView2<'_, f32>) -> Vec<[f64; 4]> {
+    strip.exact_chunks((BLOCK, BLOCK)).into_iter().map(phases).collect()
+}
+
+/// The colour difference on which neighbouring blocks agree.
+///
+/// A mosaic has two green phases on a diagonal of its cell. The differences between the other two, and between them and
+/// green, follow the colours of the scene, which change slowly. The texture of a grey scene has no preferred diagonal, and its
+/// sign changes from block to block. Stripes differ on both diagonals.
+fn local_phase_difference(strips: &[Strip], brightness: &Array1<f64>) -> PhaseDifference {
+    // Residual phases of each block, relative to its mean. The masks explain the light of a block up to a factor.
+    let residuals = |strip: &Strip| -> Vec<[f64; 4]> {
+        let blocks = strip.y_block_phases.iter().zip(&strip.y_means).enumerate();
+        let residual = |(block, (phases, mean)): (usize, (&[f64; 4], &f64))| {
+            let light = strip.mask_means.column(block).dot(brightness);
+            let factor = if light > 0.0 { mean / light } else { 0.0 };
+            let mut rest = *phases;
+            for (mask, x) in strip.mask_block_phases.iter().zip(brightness) {
+                rest.iter_mut()
+                    .zip(&mask[block])
+                    .for_each(|(rest, mask)| *rest -= factor * x * mask);
+            }
+            rest.map(|rest| if *mean > 0.0 { rest / mean } else { 0.0 })
+        };
+        blocks.map(residual).collect()
+    };
+    let strips: Vec<_> = strips.iter().map(residuals).collect();
+    let on_diagonal = |green: [usize; 2], other: [usize; 2]| {
+        let parts = |d: &[f64; 4]| {
+            let own = d[other[0]] - d[other[1]];
+            let across = 0.5 * (d[other[0]] + d[other[1]] - d[green[0]] - d[green[1]]);
+            (own, across, d[green[0]] - d[green[1]])
+        };
+        let (mut sum, mut squares, mut green_sum, mut count) = (0.0, 0.0, 0.0, 0.0);
+        for pair in strips.iter().flat_map(|strip| strip.windows(2)) {
+            let (one, next) = (parts(&pair[0]), parts(&pair[1]));
+            let product = one.0 * next.0 + one.1 * next.1;
+            sum += product;
+            squares += product * product;
+            green_sum += one.2 * next.2;
+            count += 1.0;
+        }
+        if sum <= 0.0 || green_sum > MAX_GREEN_DIFFERENCE * sum {
+            return PhaseDifference::default();
+        }
+        PhaseDifference {
+            amplitude: (sum / f64::max(count, 1.0)).sqrt(),
+            significance: sum / f64::max(squares, 1e-30).sqrt(),
+        }
+    };
+    let diagonals = [on_diagonal([1, 2], [0, 3]), on_diagonal([0, 3], [1, 2])];
+    let [one, other] = diagonals;
+    if one.significance > other.significance { one } else { other }
 }
 
 /// The largest phase difference that the masks do not explain. The standard error comes from the scatter between
@@ -439,21 +523,9 @@ impl BitUsage {
     }
 }
 
-/// Checks a measurement. `saturated` is the share of saturated pixels, if the saturation level is known;
-/// `dark_subtracted` is true if dark frames were subtracted.
-pub fn judge_measurement(
-    figures: &MeasurementFigures,
-    saturated: Option<f64>,
-    dark_subtracted: bool,
-) -> Vec<Finding> {
+/// Checks a measurement. `dark_subtracted` is true if dark frames were subtracted.
+pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) -> Vec<Finding> {
     let mut findings = Vec::new();
-    if let Some(share) = saturated.filter(|share| *share > 0.001) {
-        let detail = format!(
-            "{:.2} % of the pixels are saturated: frames are too dark there",
-            share * 100.0
-        );
-        findings.push(Finding::new(FindingCode::Saturated, detail).escalate_if(share > 0.01));
-    }
     let negative = figures.negative_area;
     if negative > 0.01 {
         let cause = if dark_subtracted {
@@ -472,8 +544,7 @@ pub fn judge_measurement(
         findings.push(finding);
         return findings;
     }
-    let PhaseDifference { amplitude, significance } = figures.mosaic;
-    if amplitude > MOSAIC_AMPLITUDE && significance > MOSAIC_SIGNIFICANCE {
+    if let Some(amplitude) = mosaic_amplitude(figures) {
         let detail = format!(
             "pixels of alternate rows and columns differ by {:.0} % of the mean: this looks like the raw mosaic of a \
              colour sensor, but the calibration is for a grey one",
@@ -482,7 +553,9 @@ pub fn judge_measurement(
         findings.push(Finding::new(FindingCode::Mosaic, detail));
     }
     findings.extend(missing_patterns(figures));
-    findings.extend(unexplained_light(figures, dark_subtracted));
+    // Masks between two pixels explain the light badly, which looks like an offset.
+    let offset = drifted_masks(figures).or_else(|| unexplained_light(figures, dark_subtracted));
+    findings.extend(offset);
     findings.extend(implausible_brightness(figures));
     findings
 }
@@ -503,6 +576,35 @@ fn shifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
             figures.explained_unshifted * 100.0
         );
         Finding::new(FindingCode::ShiftedMasks, detail)
+    })
+}
+
+/// Amplitude of the differences between the colours of a mosaic, if the measurement looks like one.
+fn mosaic_amplitude(figures: &MeasurementFigures) -> Option<f64> {
+    let global = (figures.mosaic, MOSAIC_AMPLITUDE, MOSAIC_SIGNIFICANCE);
+    let local = (figures.local_mosaic, LOCAL_MOSAIC_AMPLITUDE, LOCAL_MOSAIC_SIGNIFICANCE);
+    let found = [global, local].into_iter().find(|(difference, amplitude, significance)| {
+        difference.amplitude > *amplitude && difference.significance > *significance
+    });
+    found.map(|(difference, ..)| difference.amplitude)
+}
+
+/// Masks that are displaced by a fraction of a pixel and so explain less of the light than they should.
+fn drifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
+    let (rows, columns) = figures.drift;
+    let share = figures.offset / figures.mean;
+    let significant = rows.hypot(columns) > MIN_DRIFT
+        && figures.mean > 0.0
+        && share.abs() > OFFSET_SHARE
+        && figures.offset.abs() > 4.0 * figures.offset_uncertainty;
+    significant.then(|| {
+        let detail = format!(
+            "the masks fit better when displaced by about {rows:.1} rows and {columns:.1} columns, and are wrong \
+             about {:.0} % of the light. Most likely the optics have drifted since the calibration. A missing or wrong dark is \
+             less likely: subtract dark frames, and if the share stays, it is the drift",
+            share.abs() * 100.0
+        );
+        Finding::new(FindingCode::DriftedMasks, detail)
     })
 }
 
@@ -551,7 +653,11 @@ fn unexplained_light(figures: &MeasurementFigures, dark_subtracted: bool) -> Opt
     );
     let (code, cause) = match (dark_subtracted, share > 0.0) {
         (true, _) => (FindingCode::WrongDark, ": the dark frames do not belong to it"),
-        (false, true) => (FindingCode::NoDark, ", and no dark frames were named"),
+        (false, true) => (
+            FindingCode::NoDark,
+            ", and no dark frames were named. Stray light that reaches the sensor past the masks looks the same: it \
+             stays when the dark is subtracted",
+        ),
         (false, false) => {
             (FindingCode::NegativeOffset, ": too much was subtracted before the upload")
         }
@@ -604,7 +710,7 @@ mod tests {
         let mut study = MeasurementStudy::new(masks.dim().0);
         study.add(masks.view(), y.view());
         let figures = study.finish().unwrap();
-        let findings = judge_measurement(&figures, Some(0.0), dark_subtracted);
+        let findings = judge_measurement(&figures, dark_subtracted);
         findings.iter().map(|finding| finding.code.as_str()).collect()
     }
 
@@ -625,6 +731,11 @@ mod tests {
         assert!(codes_without_dark(&masks, &y).is_empty(), "{:?}", codes_without_dark(&masks, &y));
         let lifted = &y + 0.07 * mean;
         assert_eq!(codes_without_dark(&masks, &lifted), ["no_dark"]);
+        // A drift of 0.4 pixels is no missing dark.
+        let shifted =
+            y.slice(s![.., 1..]).to_owned() * 0.4 + y.slice(s![.., ..207]).to_owned() * 0.6;
+        let window = masks.slice(s![.., .., ..207]).to_owned();
+        assert_eq!(codes_without_dark(&window, &shifted), ["drifted_masks"]);
         assert_eq!(codes(&masks, &lifted), ["wrong_dark"]);
         assert_eq!(codes(&masks, &(&y - 0.07 * mean)), ["wrong_dark"]);
         assert_eq!(codes_without_dark(&masks, &(&y - 0.07 * mean)), ["negative_offset"]);
@@ -697,6 +808,12 @@ mod tests {
             let y = measure(masks.view(), scene(8, 208).view()).unwrap();
             let y = noisy(y, 0.02, seed).unwrap();
             assert!(codes(&masks, &coloured(&y)).contains(&"mosaic"), "seed {seed}");
+            // Complementary colours cancel over the picture.
+            let tinted = Array2::from_shape_fn(y.dim(), |(i, j)| {
+                let phase = i % 2 * 2 + j % 2;
+                y[[i, j]] * [gains[phase], [1.0, 0.85, 0.85, 1.0][phase]][usize::from(j >= 104)]
+            });
+            assert!(codes(&masks, &tinted).contains(&"mosaic"), "seed {seed}");
             // Stripes with a period of two pixels in a part of the image belong to the scene.
             let mut striped = y.clone();
             striped.slice_mut(s![..60;2, ..]).mapv_inplace(|value| value * 0.8);

@@ -17,8 +17,10 @@ use ndarray::{
 use serde::{Deserialize, Serialize};
 
 use super::error::{ReconError, Result, shape_text};
+use super::hold_out::Prediction;
 use super::motion::Steps;
 use super::operator::SensingOperator;
+use super::order::Order;
 pub use super::priors::BLOCK;
 use super::priors::nonlocal::NonlocalSpec;
 use super::priors::registry::PriorSpec;
@@ -369,6 +371,12 @@ pub struct Evidence {
     pub signs: Signs,
     /// Values of [`FEATURES`], means over the blocks of the crop.
     pub features: Vec<f32>,
+    /// Prediction of the hold-out pixels by the frames, and without masks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prediction: Option<Prediction>,
+    /// The order of the frames after the first stage, if its prior has no link along time.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub order: Option<Order>,
     /// Evidence of the first run of a stage that is run twice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub first: Option<Box<Evidence>>,
@@ -378,14 +386,16 @@ impl Evidence {
     /// Evidence from signs and features \[features, B, rows, columns\] of the same crop.
     pub(super) fn new(signs: Signs, features: &Array4<f32>) -> Self {
         let mean = |values: ArrayView3<'_, f32>| values.mean().unwrap_or(0.0);
-        Self { signs, features: features.outer_iter().map(mean).collect(), first: None }
+        let features = features.outer_iter().map(mean).collect();
+        Self { signs, features, prediction: None, order: None, first: None }
     }
 }
 
 /// A quality model from `assessment.json`, which `research/training/assessment.py` fits.
 ///
 /// It averages small networks. Their inputs are the features of a block, their means over the blocks around it, in its
-/// frame and in all frames, the evidence, the white level, and the encoder's features of the block.
+/// frame and in all frames, the evidence, and the encoder's features of the block. They were fitted with the white level as a
+/// further input, which takes its mean: the stated full scale of a measurement must not change a relative error.
 #[derive(Debug, Deserialize)]
 pub struct Model {
     features: Scaling,
@@ -475,26 +485,21 @@ impl Model {
     }
 
     /// Decimal logarithm of the expected squared error of each block \[S B, rows, columns\]. `features` are those of
-    /// [`encoded_features`], or for a stage that was run twice those of both runs. `white` is the scene's white level.
+    /// [`encoded_features`], or for a stage that was run twice those of both runs. Errors are on the scale of the solver.
     ///
     /// Without evidence the signs take their means in the fit, and the features of the whole picture replace those of the
     /// crop. Without an encoder its components take their means.
-    pub fn log_errors(
-        &self,
-        features: &Array4<f32>,
-        evidence: Option<&Evidence>,
-        white: f32,
-    ) -> Array3<f32> {
+    pub fn log_errors(&self, features: &Array4<f32>, evidence: Option<&Evidence>) -> Array3<f32> {
         let all = features.len_of(Axis(0));
         if [FEATURES.len(), FEATURES.len() + CHANNELS].contains(&all) {
-            return self.log_errors_of_one(features.view(), evidence, white);
+            return self.log_errors_of_one(features.view(), evidence);
         }
         let (result, others) = features.view().split_at(Axis(0), all / 2);
         let (first, distance) = others.split_at(Axis(0), all / 2);
-        let log_errors = self.log_errors_of_one(result, evidence, white);
+        let log_errors = self.log_errors_of_one(result, evidence);
         let Some(model) = MODELS.get(WEAKLY_SHRUNK) else { return log_errors };
         let evidence = evidence.and_then(|evidence| evidence.first.as_deref());
-        let first = model.log_errors_of_one(first, evidence, white);
+        let first = model.log_errors_of_one(first, evidence);
         combine_runs(&log_errors, &first, distance.index_axis(Axis(0), 0))
     }
 
@@ -503,7 +508,6 @@ impl Model {
         &self,
         features: ArrayView4<'_, f32>,
         evidence: Option<&Evidence>,
-        white: f32,
     ) -> Array3<f32> {
         let (_, frames, rows, columns) = features.dim();
         let encoded = features.slice(s![FEATURES.len().., .., .., ..]);
@@ -515,7 +519,7 @@ impl Model {
         let neighbourhood = neighbourhood_means(&own);
         let over_time = neighbourhood.sum_axis(Axis(1)) / frames as f32;
         let blocks = (frames * rows * columns) as f32;
-        let mut signs = vec![20.0 * white.log10()];
+        let mut signs = vec![self.signs.mean[0]];
         let mut shared: Vec<f32> = match evidence {
             Some(evidence) => {
                 signs.extend(evidence.signs.0);
@@ -701,7 +705,7 @@ mod tests {
             let encoder = encoder.as_mut().map(|encoder| encoder as &mut dyn Encoder);
             encoded_features(&op, Some(ramp().view()), ramp().view(), encoder)
         };
-        let log_errors = |values| model.log_errors(&encoded(values).unwrap(), None, 1.0);
+        let log_errors = |values| model.log_errors(&encoded(values).unwrap(), None);
         let mean = model.encoding.as_ref().unwrap().mean.clone();
         assert_eq!(log_errors(None), log_errors(Some(mean.clone())));
         let other = mean.iter().map(|value| value + 1.0).collect();
@@ -798,20 +802,19 @@ mod tests {
             let frames = (ramp(), frames.clone());
             with_first_run(&result, &first, (frames.0.view(), frames.1.view())).unwrap()
         };
-        let alone = strong.log_errors(&result, None, 1.0);
+        let alone = strong.log_errors(&result, None);
         let distant = with(&(ramp() + 1.0));
-        assert_eq!(strong.log_errors(&distant, None, 1.0), alone, "large distance: a static scene");
-        let moving = strong.log_errors(&with(&(ramp() + 1e-3)), None, 1.0);
-        let expected = weak.log_errors(&first, None, 1.0);
+        assert_eq!(strong.log_errors(&distant, None), alone, "large distance: a static scene");
+        let moving = strong.log_errors(&with(&(ramp() + 1e-3)), None);
+        let expected = weak.log_errors(&first, None);
         let difference =
             (&moving - &expected).iter().fold(0.0, |largest: f32, d| largest.max(d.abs()));
         assert!(difference < 0.02, "small distance, large error: {difference}");
         let evidence = Evidence::new(Signs([-10.0; SIGNS.len()]), &result);
         let first = Some(Box::new(evidence.clone()));
         let features = with(&(ramp() + 1e-3));
-        let known =
-            strong.log_errors(&features, Some(&Evidence { first, ..evidence.clone() }), 1.0);
-        assert_ne!(known, strong.log_errors(&features, Some(&evidence), 1.0));
+        let known = strong.log_errors(&features, Some(&Evidence { first, ..evidence.clone() }));
+        assert_ne!(known, strong.log_errors(&features, Some(&evidence)));
     }
 
     #[test]
@@ -863,7 +866,7 @@ mod tests {
             let deep = schedule.stages.len() > 1;
             let early = deep.then(|| early.view());
             let features = features(&op, early, frames.view());
-            Model::of(schedule).unwrap().log_errors(&features, None, 1.0)[[1, 1, 1]]
+            Model::of(schedule).unwrap().log_errors(&features, None)[[1, 1, 1]]
         };
         for schedule in [Schedule::gap_tv(), Schedule::pnp_tv_fastdvdnet()] {
             let (much, little) = (error(&schedule, 0.1), error(&schedule, 0.01));
@@ -878,7 +881,7 @@ mod tests {
         for model in MODELS.values() {
             let error = |decibels: f32| {
                 let evidence = Evidence::new(Signs([decibels; SIGNS.len()]), &features);
-                model.log_errors(&features, Some(&evidence), 1.0).mean().unwrap()
+                model.log_errors(&features, Some(&evidence)).mean().unwrap()
             };
             assert!(error(-20.0) > error(-35.0), "{}, {}", error(-20.0), error(-35.0));
         }

@@ -35,10 +35,10 @@ pub fn choose(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> (Range<usiz
         .unwrap_or((0..height, 0..width))
 }
 
-/// `min_x ||y - light x||^2`.
+/// `min_x ||y - light x||^2` over the measured pixels.
 fn flat_residual(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> f64 {
     let (mut yy, mut ly, mut ll) = (0.0, 0.0, 0.0);
-    for (&light, &y) in light.iter().zip(y) {
+    for (&light, &y) in light.iter().zip(y).filter(|(_, y)| !y.is_nan()) {
         let (light, y) = (f64::from(light), f64::from(y));
         yy += y * y;
         ly += light * y;

@@ -7,10 +7,12 @@ use super::crop;
 use super::error::{ReconError, Result};
 use super::hold_out::HoldOut;
 use super::operator::SensingOperator;
+use super::order::Order;
 use super::priors::Networks;
 use super::schedule::Schedule;
 use super::signs::Signs;
 use super::solver;
+use super::unmeasured::Measured;
 
 /// Evidence from the crop of the first snapshot that [`crop::choose`] selects; measurement and frames are on the scale on
 /// which the scene is on \[0,1\]. Returns `None` if no light reaches the crop, or the iteration diverges. Costs a run of
@@ -31,9 +33,10 @@ pub fn collect(
         Err(ReconError::DarkMasks { .. }) => return Ok(None),
         other => other?,
     };
-    let hold_out = HoldOut::draw(&whole, 0);
+    let Measured { op: whole, y } = Measured::new(&whole, y.slice(s![..1, rows, columns]));
+    let (whole, y) = (&*whole, y.view());
+    let hold_out = HoldOut::draw(whole, 0);
     let op = whole.clone().without(&hold_out.pixels);
-    let y = y.slice(s![..1, rows, columns]);
     let mut early: Option<Array3<f32>> = None;
     let solved = solver::run_stages(&op, y, schedule, networks, &mut (), |_, frames, _| {
         early.get_or_insert_with(|| frames.clone());
@@ -44,7 +47,7 @@ pub fn collect(
         other => other?,
     };
     let early = early.as_ref().unwrap_or(&outcome.frames);
-    let measurement = HeldOutMeasurement { whole: &whole, op: &op, y, hold_out: &hold_out };
+    let measurement = HeldOutMeasurement { whole, op: &op, y, hold_out: &hold_out };
     Ok(measurement.evidence(schedule, early, &outcome.frames))
 }
 
@@ -68,7 +71,15 @@ impl HeldOutMeasurement<'_> {
     ) -> Option<Evidence> {
         let (early, last) = (early.view(), last.view());
         let signs = Signs::of((self.op, self.y), self.hold_out, early, last)?;
+        let first_stage = early;
         let early = (schedule.stages.len() > 1).then_some(early);
-        Some(Evidence::new(signs, &features(self.whole, early, last)))
+        let prediction = Some(self.hold_out.prediction(self.op, self.y, last));
+        let is_frame_by_frame = schedule
+            .stages
+            .first()
+            .is_some_and(|stage| stage.prior.tv().is_some_and(|tv| tv.temporal_weight == 0.0));
+        let order = if is_frame_by_frame { Order::of(first_stage) } else { None };
+        let evidence = Evidence::new(signs, &features(self.whole, early, last));
+        Some(Evidence { prediction, order, ..evidence })
     }
 }

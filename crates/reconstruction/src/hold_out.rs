@@ -1,7 +1,8 @@
 //! Hold-out pixels of a measurement, by which the frames of a reconstruction without them are judged.
 
-use ndarray::{ArrayView3, Axis};
+use ndarray::{Array3, ArrayView3, Axis, s};
 use rand::{Rng, SeedableRng};
+use serde::{Deserialize, Serialize};
 
 use super::operator::SensingOperator;
 
@@ -15,15 +16,15 @@ pub(super) struct HoldOut {
 }
 
 impl HoldOut {
-    /// Draws pixels that light reaches; always the same ones for the same masks and snapshot. The operator's first snapshot
-    /// has the index `first`.
+    /// Draws pixels that light reaches and that were measured; always the same ones for the same masks and snapshot. The
+    /// operator's first snapshot has the index `first`.
     pub(super) fn draw(op: &SensingOperator, first: usize) -> Self {
         let gram = op.gram();
         let mut pixels = Vec::new();
         for snapshot in 0..op.snapshots() {
             let mut random = rand_chacha::ChaCha8Rng::seed_from_u64((first + snapshot) as u64);
-            for ((row, column), &gram) in gram.indexed_iter() {
-                if random.random_bool(SHARE) && gram > 0.0 {
+            for ((row, column), _) in gram.indexed_iter() {
+                if random.random_bool(SHARE) && op.uses((snapshot, row, column)) {
                     pixels.push((snapshot, row, column));
                 }
             }
@@ -60,6 +61,50 @@ impl HoldOut {
             f64::from(y[[s, i, j]] - (0..frames).map(masked).sum::<f32>()).powi(2)
         };
         self.pixels.iter().map(residual).collect()
+    }
+}
+
+/// Squared errors of two predictions of the hold-out pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Prediction {
+    /// `||y - H v||^2` over the hold-out pixels.
+    pub by_frames: f64,
+    /// `||y - m||^2` over the same pixels, where `m` is the mean of the other pixels around each.
+    pub by_neighbours: f64,
+}
+
+/// Distance in pixels of the farthest neighbours that predict a hold-out pixel.
+const NEIGHBOURS: usize = 3;
+
+impl HoldOut {
+    /// Compares the frames' prediction of the hold-out pixels with one that knows no masks.
+    pub(super) fn prediction(
+        &self,
+        op: &SensingOperator,
+        y: ArrayView3<'_, f32>,
+        v: ArrayView3<'_, f32>,
+    ) -> Prediction {
+        let mut is_held_out = Array3::from_elem(y.dim(), false);
+        self.pixels.iter().for_each(|&pixel| is_held_out[pixel] = true);
+        let (_, height, width) = y.dim();
+        let around = |at: usize, length: usize| {
+            at.saturating_sub(NEIGHBOURS)..length.min(at + NEIGHBOURS + 1)
+        };
+        let square = |&(snapshot, row, column): &(usize, usize, usize)| {
+            let window = s![snapshot, around(row, height), around(column, width)];
+            let (mut sum, mut count) = (0.0, 0.0);
+            for (value, hidden) in y.slice(window).iter().zip(is_held_out.slice(window)) {
+                if !hidden {
+                    sum += f64::from(*value);
+                    count += 1.0;
+                }
+            }
+            (f64::from(y[[snapshot, row, column]]) - sum / f64::max(count, 1.0)).powi(2)
+        };
+        Prediction {
+            by_frames: self.residuals(op, y, v).iter().sum(),
+            by_neighbours: self.pixels.iter().map(square).sum(),
+        }
     }
 }
 

@@ -13,6 +13,7 @@ use super::operator::SensingOperator;
 use super::priors::Networks;
 use super::schedule::Schedule;
 use super::solver::{self, Observer};
+use super::unmeasured::Measured;
 
 /// Comparison of the two snapshots at a joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,11 +56,13 @@ pub fn compare(
     }
     let mut errors = |snapshots: Range<usize>| {
         let op = op.clone().over(snapshots.len())?;
-        let hold_out = HoldOut::draw(&op, snapshots.start);
         let y = y.slice(s![snapshots.start - first..snapshots.end - first, .., ..]);
+        let Measured { op, y } = Measured::new(&op, y);
+        let (op, y) = (&*op, y.view());
+        let hold_out = HoldOut::draw(op, snapshots.start);
         let reduced = op.clone().without(&hold_out.pixels);
         match solver::reconstruct(&reduced, y, &schedule, networks, observer) {
-            Ok(outcome) => Ok(hold_out.squares(&op, y, outcome.frames.view())),
+            Ok(outcome) => Ok(hold_out.squares(op, y, outcome.frames.view())),
             Err(ReconError::Diverged { .. }) => Ok((f64::INFINITY, 1.0)),
             Err(error) => Err(error),
         }

@@ -78,6 +78,11 @@ impl SensingOperator {
         self
     }
 
+    /// True if the projection uses a pixel, given by snapshot, row and column: light reaches it, and it is not held out.
+    pub(super) fn uses(&self, pixel: (usize, usize, usize)) -> bool {
+        self.inverse_gram[pixel] > 0.0
+    }
+
     /// The masks \[B,H,W\].
     pub fn masks(&self) -> ArrayView3<'_, f32> {
         self.masks.view()

@@ -28,6 +28,7 @@ use super::projection::Problem;
 use super::schedule::{Heuristic, Schedule};
 use super::stage::{MAX_STATIC_VARIANCE, Stage};
 use super::trial::{Trial, is_strong, temporal_shrinkage};
+use super::unmeasured::Measured;
 
 /// A candidate that trails by this t-statistic after half of its iterations is abandoned.
 const ABANDON_T: f64 = 2.0;
@@ -166,9 +167,10 @@ pub fn decide(
     observer: &mut dyn Observer,
 ) -> Result<Decisions> {
     schedule.validate()?;
+    let Measured { op: whole, y: y_owned } = Measured::new(whole, y);
+    let (whole, y) = (&*whole, y_owned.view());
     let hold_out = HoldOut::draw(whole, 0);
     let op = whole.clone().without(&hold_out.pixels);
-    let y_owned = y.as_standard_layout().into_owned();
     let mut solver = Solver::new(Problem { operator: &op, y: &y_owned }, schedule, networks);
     let mut judge = Judge { op: &op, y, hold_out: &hold_out, observer };
     let mut trials: Vec<Trial> = Vec::with_capacity(schedule.stages.len());

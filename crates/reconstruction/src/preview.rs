@@ -102,13 +102,18 @@ impl Blocks {
         Ok(row)
     }
 
+    /// Pixels that were not measured (NaN) become dark in mask and measurement.
     fn gather(&mut self, masks: ArrayView3<'_, f32>, y: ArrayView2<'_, f32>) {
         let pixels = self.residual.len();
         self.masks.fill(0.0);
         self.residual.fill(0.0);
-        self.residual.iter_mut().zip(y).for_each(|(residual, &y)| *residual = y);
+        for (residual, &y) in self.residual.iter_mut().zip(y) {
+            *residual = if y.is_nan() { 0.0 } else { y };
+        }
         for (line, mask) in self.masks.chunks_exact_mut(pixels).zip(masks.outer_iter()) {
-            line.iter_mut().zip(mask).for_each(|(value, &c)| *value = c);
+            for ((value, &c), y) in line.iter_mut().zip(mask).zip(y) {
+                *value = if y.is_nan() { 0.0 } else { c };
+            }
         }
     }
 

@@ -27,7 +27,7 @@ impl ScaleEstimator {
     /// and the frames are multiplied by it afterwards.
     ///
     /// # Errors
-    /// Sizes that differ, or a measurement without light.
+    /// Sizes that differ, or a measurement without light. NaN were not measured.
     pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
         if y.dim() != self.light.dim() {
             return Err(ReconError::Shape {
@@ -38,7 +38,8 @@ impl ScaleEstimator {
         }
         // Pixels with little light have a ratio of noise to almost nothing.
         let floor = 0.25 * self.light.mean().unwrap_or(0.0);
-        let lit = y.iter().zip(&self.light).filter(|&(_, &light)| light > floor);
+        let is_lit = |&(y, light): &(&f32, &f32)| *light > floor && !y.is_nan();
+        let lit = y.iter().zip(&self.light).filter(is_lit);
         let mut ratios: Vec<f32> = lit.map(|(&y, &light)| y / light).collect();
         if ratios.is_empty() {
             return Err(ReconError::DarkMasks { frames: 0 });

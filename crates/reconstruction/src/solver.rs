@@ -15,6 +15,7 @@ use super::projection::Problem;
 use super::schedule::Schedule;
 use super::stage::Stage;
 use super::static_regions::{blend_moving_regions, motion_map};
+use super::unmeasured::Measured;
 
 /// Why a reconstruction ended; by name `converged` or `max-iterations`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
@@ -48,7 +49,8 @@ pub struct Outcome {
 }
 
 /// Reconstructs the `S B` frames of a run of snapshots `y` \[S,H,W\], both on the scale on which the scene is on \[0,1\].
-/// The priors see the frames of all snapshots as one clip; each measured pixel depends on its own `B` frames.
+/// The priors see the frames of all snapshots as one clip; each measured pixel depends on its own `B` frames. NaN of `y` were
+/// not measured and are left out.
 ///
 /// Starts from 0. Networks are requested when a stage needs them.
 ///
@@ -122,8 +124,9 @@ pub(crate) fn run_stages(
     }
     // Before anything is computed, so that a missing network is reported at once.
     schedule.networks().into_iter().try_for_each(|which| networks.network(which).map(|_| ()))?;
-    let y = y.as_standard_layout().into_owned();
-    let mut solver = Solver::new(Problem { operator: op, y: &y }, schedule, networks);
+    let measured = Measured::new(op, y);
+    let problem = Problem { operator: &measured.op, y: &measured.y };
+    let mut solver = Solver::new(problem, schedule, networks);
     let mut converged = false;
     for (index, stage) in schedule.stages.iter().enumerate() {
         let weak;

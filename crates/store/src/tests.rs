@@ -205,7 +205,7 @@ impl Lab {
     /// Does the task as a worker would and says what the store answered.
     async fn work(&self, task: &ClaimedTask) -> Heartbeat {
         let product = match task.kind {
-            TaskKind::Prepare => Product::Record,
+            TaskKind::Prepare | TaskKind::White => Product::Record,
             TaskKind::Pilot => Product::TileCost(0.5),
             TaskKind::Preview { snapshot } => self.blob(&format!("preview {snapshot}")),
             TaskKind::Tile { snapshot, tile, .. } => self.blob(&format!("{snapshot} {tile}")),
@@ -318,9 +318,10 @@ async fn a_job_runs_in_order_and_leaves_its_results_and_no_tiles() {
         TaskKind::Preview { snapshot: 1 },
         tile(0, 0),
         tile(0, 1),
-        TaskKind::Assemble { snapshot: 0 },
         tile(1, 0),
         tile(1, 1),
+        TaskKind::White,
+        TaskKind::Assemble { snapshot: 0 },
         TaskKind::Assemble { snapshot: 1 },
         TaskKind::Manifest,
     ];

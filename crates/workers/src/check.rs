@@ -5,10 +5,12 @@ use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+use ndarray::Array2;
+
 use super::model_check;
 use super::model_process::ModelCommand;
 use super::transport::{Check, TaskError};
-use engine::intake::{self, Exposure, IntakeError, Refusal, RefusalCode, Source, plan};
+use engine::intake::{self, Behind, Exposure, IntakeError, Refusal, RefusalCode, Source, plan};
 use engine::job::{
     CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Sequence, Sha256,
     Submission, TaskStage, keeps_mosaic,
@@ -74,7 +76,7 @@ pub(super) fn check(
     let calibration = check.task.calibration.as_ref();
     let checked = match (&check.task.request.submission, calibration) {
         (Submission::Calibration(request), _) => match &request.captures {
-            Some(captures) => running.captures(captures, request.mosaic),
+            Some(captures) => running.captures(captures, request),
             None => running.masks(request),
         },
         (Submission::Measurement(request), Some(masks)) => running.measurement(request, masks),
@@ -147,17 +149,29 @@ impl Running<'_> {
     }
 
     /// Checks the headers of captures.
-    fn captures(&self, captures: &Captures, mosaic: Option<Mosaic>) -> Result<Checked> {
+    fn captures(&self, captures: &Captures, request: &CalibrationRequest) -> Result<Checked> {
         for (pointer, upload) in captures.uploads() {
             self.upload(upload, &pointer)?;
             self.proceed(0.0)?;
         }
         let dir = self.check.store.dir();
         let plan = plan(&captures.map(|upload| dir.blob(upload)), &self.limits())?;
-        check_mosaic(mosaic, plan.size)?;
+        check_mosaic(request.mosaic, plan.size)?;
+        self.bad_pixels(request, plan.size)?;
         // Two copies: as measured, and scaled.
         self.reserve(plan.bytes, 2)?;
         Ok(Checked::Captures(plan.seconds))
+    }
+
+    /// The map of bad pixels of a calibration with masks of this size.
+    fn bad_pixels(
+        &self,
+        request: &CalibrationRequest,
+        size: (usize, usize),
+    ) -> Result<Option<Array2<bool>>> {
+        let Some(map) = request.bad_pixels else { return Ok(None) };
+        let map = self.upload(map, "/bad_pixels")?;
+        Ok(Some(intake::bad_pixels(&map, size, &self.limits())?))
     }
 
     /// Checks masks and writes them on \[0,1\].
@@ -176,7 +190,8 @@ impl Running<'_> {
         let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         let mut writer = self.writer(&info)?;
         let mut done = 0.0;
-        let statistics = intake::masks(opened, |mask| {
+        let bad = self.bad_pixels(request, (info.height, info.width))?;
+        let statistics = intake::masks(opened, bad.as_ref(), |mask| {
             done += 1.0;
             self.proceed(done / info.frames as f64)?;
             writer.write_frame(mask)
@@ -235,8 +250,10 @@ impl Running<'_> {
         }
         let mut writer = self.writer(&info)?;
         let exposure = Exposure { dark, saturation: request.saturation };
+        let prepared = self.check.store.dir().blob(&calibration.prepared);
+        let behind = Behind::stored(&prepared, masks.mosaic, &limits)?;
         let mut done = 0.0;
-        let passed = intake::measurement(opened, &exposure, &limits, |y| {
+        let passed = intake::measurement(opened, &exposure, &behind, &limits, |y| {
             done += 1.0;
             self.proceed(done / info.frames as f64)?;
             writer.write_frame(y)
@@ -245,9 +262,8 @@ impl Running<'_> {
         let prepared = self.check.store.dir().blob(&calibration.prepared);
         let arrays = (prepared.as_path(), staged.path());
         let has_dark = !exposure.dark.is_empty();
-        let mut warnings = passed.findings;
-        let saturated = passed.saturated.as_deref();
-        warnings.extend(intake::judge(arrays, masks.mosaic, saturated, has_dark, &limits)?);
+        let judged = intake::judge(arrays, masks.mosaic, has_dark, &limits)?;
+        let warnings = intake::combined(passed.findings, judged);
         let estimated = Sequence::from_camera(request.camera_fps, request.exposure_s, masks.frames);
         let facts = NewMeasurement {
             name: request.name,

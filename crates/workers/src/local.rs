@@ -18,10 +18,10 @@ use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::blend::StoredTile;
 use engine::pipeline::manifest::{CameraRecord, Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
-use engine::pipeline::movie::MovieTask;
+use engine::pipeline::movie::{DisplayWindow, MovieTask};
 use engine::pipeline::networks::{ModelFile, ModelRecord};
 use engine::pipeline::pilot::full_schedule;
-use engine::pipeline::records::{PilotRecord, PreparedRecord};
+use engine::pipeline::records::{PilotRecord, PreparedRecord, WhiteRecord};
 use engine::pipeline::tile::TileInput;
 use formats::planar;
 use store::{
@@ -62,6 +62,7 @@ impl Local {
             Work::Calibration(task) => match &task.captures {
                 Some(captures) => Ok(TaskInput::Captures {
                     files: captures.map(|upload| self.path(*upload)),
+                    bad_pixels: task.bad_pixels.map(|map| self.path(map)),
                     scratch: self.store.staged_path().map_err(failed)?,
                     masks: Box::new(self.store.blob_writer().map_err(failed)?),
                 }),
@@ -100,15 +101,16 @@ impl Local {
             TaskKind::Tile { snapshot, tile, .. } => {
                 TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
             }
+            TaskKind::White => TaskInput::White {
+                recipe: Box::new(recipe(task)?),
+                snapshots: spec.snapshots,
+                tiles: self.stored_tiles(&task.tiles)?,
+            },
             TaskKind::Assemble { snapshot } => TaskInput::Assemble {
                 job: *job,
                 recipe: Box::new(recipe(task)?),
                 snapshot,
-                tiles: task
-                    .tiles
-                    .iter()
-                    .map(|tile| self.stored_tile(tile))
-                    .collect::<Result<_, _>>()?,
+                tiles: self.stored_tiles(&task.tiles)?,
                 folder: folder()?,
             },
             TaskKind::Manifest => TaskInput::Manifest {
@@ -143,6 +145,10 @@ impl Local {
         let mut writer = planar::writer(self.store.blob_writer()?, count, height, width)?;
         frames.outer_iter().try_for_each(|frame| writer.write_frame(frame))?;
         Ok(writer.finish()?.finish()?)
+    }
+
+    fn stored_tiles(&self, tiles: &[TileResult]) -> Result<Vec<StoredTile>, PipelineError> {
+        tiles.iter().map(|tile| self.stored_tile(tile)).collect()
     }
 
     fn stored_tile(&self, stored: &TileResult) -> Result<StoredTile, PipelineError> {
@@ -264,20 +270,33 @@ fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, 
     T::deserialize(record).map_err(PipelineError::record(what))
 }
 
-/// White level of the scene, as the prepare task recorded it.
+/// The solver's scale, as the prepare task recorded it.
 fn white(prepared: Option<&Value>) -> Result<f32, PipelineError> {
     Ok(parsed::<PreparedRecord>("prepare task", prepared.unwrap_or(&Value::Null))?.white)
 }
 
+/// The white level of the frames, as its task recorded it.
+fn white_level(record: &Value) -> Result<f32, PipelineError> {
+    Ok(parsed::<WhiteRecord>("white level", record)?.white_level)
+}
+
 fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
-    let MovieWork { spec, measurement, prepared, arrays, .. } = work;
+    let MovieWork { spec, measurement, white, window, arrays, .. } = work;
+    let window = match window {
+        Some(window) => parsed("movie", window)?,
+        None => DisplayWindow {
+            black: 0.0,
+            white: white_level(white.as_ref().unwrap_or(&Value::Null))?,
+        },
+    };
     let facts = &measurement.facts;
     let frames = spec.shape.frames;
     let record = CameraRecord::new((facts.camera_fps, facts.exposure_s), 0, frames);
     let exposure = record.and_then(|record| record.frame_exposure_s(frames));
     Ok(MovieTask {
         shape: spec.shape,
-        white: white(prepared.as_ref())?,
+        window,
+        requested: work.window.is_some(),
         scene_fps: exposure.map(|seconds| 1.0 / seconds),
         clips: arrays.clone(),
     })
@@ -324,6 +343,7 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
     let (spec, calibration, measurement) =
         (&task.spec, &task.calibration.facts, &task.measurement.facts);
     let pilot = pilot(task)?;
+    let normalisation = white(task.prepared.as_ref())?;
     Ok(Recipe {
         program_version: VERSION,
         algorithm: spec.algorithm,
@@ -340,7 +360,9 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,
             measurement_full_scale: measurement.full_scale,
-            white: white(task.prepared.as_ref())?,
+            normalisation,
+            // Before it is determined, nothing is displayed or judged by it.
+            white_level: task.white.as_ref().map_or(Ok(normalisation), white_level)?,
         },
         tile_plan: spec.tile_plan()?,
         runs: spec.sequence_plan()?,

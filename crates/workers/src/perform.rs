@@ -1,5 +1,7 @@
 //! Performs one task of any kind.
 
+use std::collections::BTreeMap;
+
 use ndarray::Array3;
 use serde::Serialize;
 use serde_json::Value;
@@ -19,7 +21,9 @@ use engine::pipeline::pilot::{self, Pilot, full_schedule};
 use engine::pipeline::progress::Monitor;
 use engine::pipeline::records::{
     CostRecord, PilotRecord, PreparedRecord, RunRecord, SnapshotRecord, TileRecord, TileTaskRecord,
+    WhiteRecord,
 };
+use engine::pipeline::scale::Histogram;
 use engine::pipeline::tile::{reconstruct_tile, run_network};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{write_manifest, write_result};
@@ -73,6 +77,11 @@ pub(super) fn perform(
             let (record, frames) = tile(transport, &task, engines, monitor)?;
             (json(&record)?, Output::Stack(frames))
         }
+        TaskInput::White { recipe, snapshots, tiles } => {
+            let white_level = white_level(&recipe, snapshots, &tiles, monitor)?;
+            monitor.reach(TaskStage::Reading, 1.0);
+            (json(&WhiteRecord { white_level })?, Output::Record)
+        }
         TaskInput::Assemble { job, recipe, snapshot, tiles, folder } => {
             let shares = verified_shares(&recipe, snapshot, &tiles, monitor)?;
             let tiles: Vec<&StoredTile> = shares.iter().flat_map(|(_, tiles)| tiles).collect();
@@ -113,12 +122,13 @@ pub(super) fn perform(
             let checked = check(&task, engines.models.command(), monitor)?;
             (Value::Null, Output::Checked(Box::new(checked)))
         }
-        TaskInput::Captures { files, scratch, masks } => {
+        TaskInput::Captures { files, bad_pixels, scratch, masks } => {
             let open =
                 |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
             let limits = Limits::default();
+            let files = (&files, bad_pixels.as_deref());
             let (calibrated, masks) =
-                calibrate(&files, &limits, scratch.path(), open, &mut |share| {
+                calibrate(files, &limits, scratch.path(), open, &mut |share| {
                     proceed(share, monitor)
                 })?;
             let masks = masks.finish().map_err(TransportError::from)?;
@@ -127,7 +137,7 @@ pub(super) fn perform(
         }
         TaskInput::Movie(task, file) => {
             movie::write(file.path(), &task, monitor)?;
-            (Value::Null, Output::File(file))
+            (json(&task.requested.then_some(task.window))?, Output::File(file))
         }
         TaskInput::Report(masks) => {
             let masks = Reader::open(&masks, &Limits::default()).map_err(IntakeError::from)?;
@@ -189,6 +199,36 @@ fn run_pilot(
     let SnapshotRange { first, count } = snapshots;
     let input = arrays.window(first..first + count, task.crop, white)?;
     Ok(pilot::decide(input, task, networks, &mut monitor.observe(task.schedule.clone()))?)
+}
+
+/// The white level of all frames of a job. All tiles must be there.
+fn white_level(
+    recipe: &Recipe,
+    snapshots: SnapshotRange,
+    tiles: &[StoredTile],
+    monitor: &Monitor,
+) -> Result<f32, PipelineError> {
+    let mut histogram = Histogram::default();
+    let runs = tiles.chunk_by(|one, next| one.run == next.run);
+    runs.clone().try_for_each(|run| blend::verify(&recipe.tile_plan, run, monitor))?;
+    let runs: BTreeMap<u32, &[StoredTile]> = runs.map(|run| (run[0].run, run)).collect();
+    for (index, snapshot) in snapshots.indices().enumerate() {
+        let shares = recipe.shares(snapshot as usize).into_iter().map(|share| {
+            let run = snapshot - share.place as u32;
+            let tiles = runs.get(&run).map(|tiles| tiles.to_vec()).ok_or_else(|| {
+                let problem = format!("the run from snapshot {run} has no tiles");
+                PipelineError::Record { what: "tiles", problem }
+            })?;
+            Ok::<_, PipelineError>((share, tiles))
+        });
+        let shares = shares.collect::<Result<Vec<_>, _>>()?;
+        for k in 0..recipe.shape.frames {
+            monitor.check()?;
+            histogram.add(&blend::stored_frame(&recipe.tile_plan, &shares, k)?);
+        }
+        monitor.reach(TaskStage::Reading, (index + 1) as f64 / f64::from(snapshots.count));
+    }
+    Ok(scale::white_level(&histogram, recipe.scale.normalisation))
 }
 
 /// Lists the runs that contribute to a snapshot, each with its tiles. Fails if a tile is missing or damaged.

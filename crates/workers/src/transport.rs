@@ -106,7 +106,7 @@ pub struct Claim {
 /// The work of a task, with its complete input.
 #[derive(Debug)]
 pub enum TaskInput {
-    /// Estimate the white level of a job.
+    /// Estimate the solver's scale of a job.
     Prepare {
         arrays: Arrays,
         snapshots: SnapshotRange,
@@ -127,6 +127,12 @@ pub enum TaskInput {
         mosaic: Option<Mosaic>,
     },
     Tile(Box<TileTask>),
+    /// Determine the white level of all frames of a job from all its tiles.
+    White {
+        recipe: Box<Recipe>,
+        snapshots: SnapshotRange,
+        tiles: Vec<StoredTile>,
+    },
     /// Blend all tiles of the runs that contain a snapshot, and write its frames to the folder.
     Assemble {
         job: JobId,
@@ -147,6 +153,8 @@ pub enum TaskInput {
     /// Make masks from captures, and a report on them. `scratch` holds the masks until their scale is known.
     Captures {
         files: CaptureFiles,
+        /// A map of bad pixels.
+        bad_pixels: Option<PathBuf>,
         scratch: StagedPath,
         masks: Box<BlobWriter>,
     },

@@ -100,7 +100,7 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         let evidence = tile.outcome.evidence.as_ref().or(pilot);
         let schedule = tile.pilot.as_ref().map(|pilot| pilot.decide(&key.schedule));
         let expected = Model::of(schedule.as_ref().unwrap_or(&key.schedule)).map(|model| {
-            let errors = model.log_errors(seen_of_tile, evidence, tile.white);
+            let errors = model.log_errors(seen_of_tile, evidence);
             let psnr = |frame: ArrayView2<'_, f32>| {
                 -10.0 * frame.mapv(|error| 10f32.powf(error)).mean().unwrap_or(0.0).log10()
             };

@@ -142,7 +142,7 @@ fn a_row_of_the_tables_equals_the_result_of_reconstruct() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let file: Value = serde_json::from_slice(&bytes(&files.path("out/tables.json"))).unwrap();
     let row = &file["rows"][0];
-    assert_eq!((&row["psnr_db"], &row["ssim"]), (&report["psnr_db"], &report["ssim"]));
+    assert_eq!((&row["psnr_db"], &row["ssim"]), (&report["psnr_unit_db"], &report["ssim"]));
     assert_eq!(row["clip"], "square");
 
     let refuse = |more: &[&str]| refusal(&experiment(&[&line[..], more].concat()));

@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, h, put, say } from "./dom.js";
-import { bytes, duration, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
+import { bytes, duration, expectedRange, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
 import { isAborted, get, upload } from "./api.js";
 import { keepTruth, truthOf } from "./storage.js";
 import { networks, ran } from "./provenance.js";
@@ -210,7 +210,7 @@ function figures(jobs, manifests, measured) {
   const rows = [
     measured && ["PSNR", (_, index) => (measured[index].psnr === null ? "∞" : `${figure(measured[index].psnr, 4)} dB`), "quality"],
     measured && ["SSIM", (_, index) => figure(measured[index].ssim, 4), "quality"],
-    ["Expected PSNR", (job) => (job.assessment ? `${job.assessment.psnr_low_db} to ${job.assessment.psnr_high_db} dB` : "–")],
+    ["Expected PSNR", (job) => expectedRange(job.assessment)],
     ["State", (job) => job.state],
     ["Algorithm", (job) => job.algorithm],
     ["Planned iterations per tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],

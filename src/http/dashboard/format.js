@@ -1,5 +1,16 @@
 // Formats numbers, times and states for display.
 
+/** An expected PSNR; the model does not distinguish values above 40 dB. */
+export const aboutDecibels = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(0)} dB`);
+
+/** The interval of an assessment's expected PSNR, or a dash where there is no figure. */
+export function expectedRange(assessment) {
+  if (!assessment || assessment.psnr_db === null) return "–";
+  const { psnr_low_db: low, psnr_high_db: high } = assessment;
+  if (low >= 40) return "40 dB or more";
+  return high >= 40 ? `${low} dB or more` : `${low} to ${high} dB`;
+}
+
 /** 75 -> "1 min 15 s". */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";

@@ -2,7 +2,7 @@
 
 import { announce, h, place, put, say } from "./dom.js";
 import { cancelAll, removeAll, actions } from "./actions.js";
-import { doubts, nameOf, moment, momentInFull, shapeOf, short, stageOf, timeOf } from "./format.js";
+import { aboutDecibels, doubts, expectedRange, nameOf, moment, momentInFull, shapeOf, short, stageOf, timeOf } from "./format.js";
 import { filters } from "./filters.js";
 import { get } from "./api.js";
 import { table } from "./rows.js";
@@ -246,7 +246,7 @@ function checks(cell, job, before) {
   const assessment = job.assessment;
   put(cell, found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text));
   if (!found && !assessment) put(cell, h("span", { class: "mark fine" }, "no findings"));
-  if (assessment) cell.append(h("span", { class: `sub grade ${assessment.grade}`, title: `Expected PSNR ${assessment.psnr_low_db} to ${assessment.psnr_high_db} dB` }, `about ${assessment.psnr_db.toFixed(0)} dB`));
+  if (assessment) cell.append(h("span", { class: `sub grade ${assessment.grade}`, title: `Expected PSNR ${expectedRange(assessment)}` }, assessment.psnr_db === null ? assessment.grade : `about ${aboutDecibels(assessment.psnr_db)}`));
 }
 
 function created(cell, job) {

@@ -1,7 +1,7 @@
 // The card "Is it good?": findings of the checks, grade of the calibration, expected PSNR, and the PSNR and
 // SSIM against true frames if they are attached.
 
-import { bytes, figure } from "./format.js";
+import { aboutDecibels, bytes, expectedRange, figure } from "./format.js";
 import { facts, h, put, say } from "./dom.js";
 import { findings } from "./report.js";
 import { isAborted, get, upload } from "./api.js";
@@ -58,12 +58,14 @@ export class Verdict {
   /** Shows the expected PSNR from the manifest, with its interval and reasons. */
   showExpected(assessment) {
     this.assessment = assessment;
-    const { psnr_db: psnr, psnr_low_db: low, psnr_high_db: high, reasons } = this.assessment ?? {};
+    const { psnr_db: psnr, reasons } = this.assessment ?? {};
     const warned = new Set(this.job.warnings.map((warning) => warning.code));
     const own = reasons?.filter((reason) => !warned.has(reason.code)) ?? [];
     put(this.expected, this.assessment && [
-      h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, about(psnr))),
-      h("p", { class: "muted" }, `The true PSNR lies between ${low.toFixed(0)} and ${about(high)} in four of five cases. Select “Expected error” above the frames to see where the error is largest.`),
+      psnr === null
+        ? h("p", { class: "muted" }, "No expected PSNR: the findings put the scale, the dark or the masks in doubt.")
+        : [h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, aboutDecibels(psnr))),
+          h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`)],
       findings(own)]);
   }
 
@@ -114,14 +116,11 @@ export class Verdict {
     const [text, kind, meaning] = LEVELS.find(([, , , least]) => (found.psnr ?? Infinity) >= least);
     this.judge(found.psnr === null ? "Identical to the true frames" : text, kind, meaning);
     put(this.measured, h("p", { class: "quality" }, h("b", null, found.psnr === null ? "∞" : `${figure(found.psnr, 3)} dB`), " PSNR", found.ssim !== null && [", ", h("b", null, figure(found.ssim, 3)), " SSIM"]),
-      h("p", { class: "muted" }, `Measured against ${name}; mean of ${found.frames.length} frames.`),
+      h("p", { class: "muted" }, `Measured against ${name}; mean of ${found.frames.length} frames, relative to the white level ${figure(found.peak)}.`),
       h("details", null, h("summary", null, "Frame by frame"), facts(found.frames.map((frame) => [`Frame ${frame.frame}`, `${frame.psnr === null ? "∞" : `${figure(frame.psnr, 3)} dB`}${frame.ssim === null ? "" : `, SSIM ${figure(frame.ssim, 3)}`}`]))));
     return true;
   }
 }
-
-/** The model does not distinguish values above 40 dB. */
-const about = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(0)} dB`);
 
 /** Verdicts on an expected PSNR without findings, by grade. */
 const EXPECTED = {

@@ -5,14 +5,17 @@ use axum::Json;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
+use super::super::app::App;
 use super::super::download::Download;
 use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Body, Caller, Params};
-use super::super::results::{file_name, media_type};
+use super::super::results::{file_name, media_type, white_level};
 use super::Format;
 use super::clip::Clip;
 use engine::job::{JobId, MIN_MOVIE_SIDE};
+use engine::pipeline::movie::DisplayWindow;
 use store::{Movie, StoreError};
 
 const NAME: &str = "movie.mp4";
@@ -27,6 +30,10 @@ pub(in crate::http) struct ExportRequest {
     format: CreatedFormat,
     /// The snapshot; by default all snapshots of the job, in order.
     snapshot: Option<u32>,
+    /// The value of the frames to show as black; by default 0.
+    black: Option<f32>,
+    /// The value of the frames to show as white; by default the job's white level.
+    white: Option<f32>,
 }
 
 /// Formats that a worker makes on request. The service composes all others while a client reads them.
@@ -60,8 +67,9 @@ enum ExportState {
 pub(in crate::http) async fn create(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    Body(ExportRequest { format: CreatedFormat::Mp4, snapshot }): Body<ExportRequest>,
+    Body(request): Body<ExportRequest>,
 ) -> Result<Response> {
+    let ExportRequest { format: CreatedFormat::Mp4, snapshot, black, white } = request;
     let job = app.store.job(&access.lab, id).await?;
     if let Some(missing) = snapshot.filter(|snapshot| !job.spec.snapshots.contains(*snapshot)) {
         return Err(ApiError::field("/snapshot", format!("the job has no snapshot {missing}")));
@@ -70,7 +78,8 @@ pub(in crate::http) async fn create(
     let place = format!("/v1/jobs/{id}{base}/exports/mp4");
     let clip = Clip { app, job, snapshot, format: Format::Mp4 };
     check(&clip).await?;
-    let (status, body) = match clip.app.store.create_movie(&clip.job, snapshot).await? {
+    let window = display_window(&clip.app, id, (black, white)).await?;
+    let (status, body) = match clip.app.store.create_movie(&clip.job, snapshot, &window).await? {
         Movie::Ready { .. } => {
             (StatusCode::OK, ExportBody { state: ExportState::Ready, percent: 100.0 })
         }
@@ -119,6 +128,27 @@ async fn check(clip: &Clip) -> Result<()> {
     }
     clip.pieces().await?;
     Ok(())
+}
+
+/// The requested values of black and white as the store keeps them; null for the job's white level.
+async fn display_window(
+    app: &App,
+    job: JobId,
+    (black, white): (Option<f32>, Option<f32>),
+) -> Result<Value> {
+    if black.is_none() && white.is_none() {
+        return Ok(Value::Null);
+    }
+    let white = match white {
+        None => white_level(app, job).await?,
+        white => white,
+    };
+    let (black, white) = (black.unwrap_or(0.0), white.unwrap_or(1.0));
+    if !(black.is_finite() && white.is_finite() && black < white && (white - black).is_finite()) {
+        let detail = format!("black is {black} and white is {white}; black must be below white");
+        return Err(ApiError::field("/black", detail));
+    }
+    serde_json::to_value(DisplayWindow { black, white }).map_err(|error| ApiError::internal(&error))
 }
 
 fn pending(fraction: Option<f64>) -> ExportBody {

@@ -78,11 +78,11 @@ pub(super) async fn preview<N: Named>(
         let detail = format!("size is {size}; it must be from {least} to {most}");
         return Err(ApiError::new(Code::InvalidQuery, detail));
     }
-    let window = match (query.black, query.white) {
+    let window = match (query.black, query.white.or(picture.white)) {
         (None, None) => None,
-        (Some(black), Some(white)) => Some(window(black, white)?),
-        _ => {
-            let detail = "black and white come together, or neither";
+        (black, Some(white)) => Some(window(black.unwrap_or(0.0), white)?),
+        (Some(_), None) => {
+            let detail = "black needs white here: this picture has no white level";
             return Err(ApiError::new(Code::InvalidQuery, detail));
         }
     };
@@ -121,14 +121,16 @@ pub(super) async fn spread<N: Named>(
     let (height, width) = (picture.height, picture.width);
     let levels = picture.level_within(TILE);
     let region = picture.whole(picture.level_within(PREVIEW));
+    let white = picture.white;
     let found = rendering::spread(&*app.pictures.reduced(Arc::new(picture), region).await?);
     let (minimum, maximum, low, high) = (found.minimum, found.maximum, found.low, found.high);
+    let (low, high) = white.map_or((low, high), |white| (0.0, white));
     let body = SpreadBody { height, width, tile: TILE, levels, minimum, maximum, low, high };
     conditional::json(&body, &headers)
 }
 
 /// The values that become black and white.
-fn window(black: f32, white: f32) -> Result<(f32, f32)> {
+pub(super) fn window(black: f32, white: f32) -> Result<(f32, f32)> {
     if black.is_finite() && white.is_finite() && black < white && (white - black).is_finite() {
         return Ok((black, white));
     }

@@ -11,7 +11,7 @@ use crate::http::error::{ApiError, Code, Result};
 use crate::http::intake;
 use crate::http::jobs::with_snapshot;
 use crate::http::rendering::Picture;
-use crate::http::results::result_file;
+use crate::http::results::{result_file, white_level};
 use engine::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
 use engine::pipeline::records::TileTaskRecord;
 use formats;
@@ -232,7 +232,7 @@ async fn snapshots_of(app: &App, measurement: &Measurement) -> Result<Stack> {
 
 async fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Result<Stack> {
     let files = Files::Prepared(app.store.intact_blob(sha256).await?);
-    Ok(Stack { shape, identity: sha256.to_string(), files, mosaic: None })
+    Ok(Stack { shape, identity: sha256.to_string(), files, mosaic: None, white: None })
 }
 
 /// The frames of a snapshot: those of the result, or the tiles that are done, on the preview. The bytes of
@@ -247,6 +247,7 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
                 identity: file.sha256.to_string(),
                 files: Files::Frames(path),
                 mosaic: spec.shape.mosaic,
+                white: white_level(app, job.id).await?,
             });
         }
         Err(StoreError::NotFound { .. }) => {}
@@ -279,7 +280,7 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };
     let identity = Sha256::of(hashes.as_bytes()).to_string();
     let files = Files::Tiles(Arc::new(unfinished));
-    Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic })
+    Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic, white: None })
 }
 
 /// The expected error of frame `k`, from 0.

@@ -21,6 +21,8 @@ pub(super) struct Stack {
     pub(super) files: Files,
     /// Of frames that a colour sensor saw: result files have their colours, tiles have not.
     pub(super) mosaic: Option<Mosaic>,
+    /// The white level of the job's frames; `None` before it is known, and for other stacks.
+    pub(super) white: Option<f32>,
 }
 
 #[derive(Debug, Clone)]
@@ -138,14 +140,16 @@ impl Stack {
             settled: self.settled(),
             channels: self.channels(),
             depth: depth * self.channels().count(),
+            white: None,
             read: Box::new(move |rows, columns| read(&stack, rows, columns)),
         }
     }
 
     pub(super) fn frame(&self, k: usize) -> Picture {
-        self.picture(&format!("frame {k}"), 1, move |stack, rows, columns| {
+        let picture = self.picture(&format!("frame {k}"), 1, move |stack, rows, columns| {
             Ok(first(stack.window(k..k + 1, rows, columns)?))
-        })
+        });
+        Picture { white: self.white, ..picture }
     }
 
     /// Frame `k` without the one before it.
@@ -162,7 +166,7 @@ impl Stack {
         let picture = self.picture(&format!("slice {row}"), 1, move |stack, rows, columns| {
             Ok(stack.window(rows, row..row + 1, columns)?.index_axis_move(Axis(1), 0))
         });
-        Picture { height: frames, ..picture }
+        Picture { height: frames, white: self.white, ..picture }
     }
 
     pub(super) fn mean(&self) -> Picture {
@@ -227,6 +231,7 @@ pub(super) fn sent(
         settled: true,
         channels: Channels::Grey,
         depth: 1,
+        white: None,
         read: Box::new(move |rows, columns| {
             let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
             let whole = match &mut *kept {
@@ -251,6 +256,7 @@ pub(super) fn errors(
         settled: true,
         channels: Channels::Grey,
         depth: 1,
+        white: None,
         read: Box::new(move |rows, columns| {
             let of_blocks = |range: &Range<usize>| range.start / BLOCK..range.end.div_ceil(BLOCK);
             let (down, across) = (of_blocks(&rows), of_blocks(&columns));
@@ -359,7 +365,7 @@ mod tests {
     }
 
     fn stack(shape: (usize, usize, usize), files: Files) -> Stack {
-        Stack { shape, identity: "x".into(), files, mosaic: None }
+        Stack { shape, identity: "x".into(), files, mosaic: None, white: None }
     }
 
     #[test]

@@ -105,6 +105,7 @@ mod tests {
             settled: true,
             channels: Channels::Grey,
             depth: 1,
+            white: None,
             read: Box::new(move |rows, columns| {
                 reads.fetch_add(1, Ordering::Relaxed);
                 Ok(Array2::zeros((rows.len(), columns.len())))

@@ -25,6 +25,8 @@ pub(in crate::http) struct Picture {
     pub(in crate::http) channels: Channels,
     /// Samples that are read for each pixel.
     pub(in crate::http) depth: usize,
+    /// The value that is shown as white, with black at 0, unless the request says otherwise.
+    pub(in crate::http) white: Option<f32>,
     pub(in crate::http) read: Box<Read>,
 }
 
@@ -163,6 +165,7 @@ mod tests {
             identity: "test".into(),
             settled: true,
             depth,
+            white: None,
             read: Box::new(move |rows, columns| Ok(values.slice(s![rows, columns]).to_owned())),
         }
     }

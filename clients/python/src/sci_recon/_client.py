@@ -84,6 +84,7 @@ class Client:
         masks_packing: str | None = None,
         masks_name: str | None = None,
         mosaic: str | None = None,
+        bad_pixels: Source | None = None,
         dark: Source | Sequence[Source] = (),
         saturation: int | None = None,
         full_scale: float | None = None,
@@ -126,6 +127,7 @@ class Client:
                 frames=masks_frames,
                 packing=masks_packing,
                 mosaic=mosaic,
+                bad_pixels=bad_pixels,
                 name=masks_name,
             )
         taken = self.measure(
@@ -171,13 +173,14 @@ class Client:
         frames: tuple[int, int] | None = None,
         packing: str | None = None,
         mosaic: str | None = None,
+        bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Makes a calibration of masks [B, H, W]; of a colour sensor with a `mosaic`.
 
         `array` is their name in a file of several arrays. `crop` selects a window with `row`, `column`, `height` and
         `width`, and `frames` the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed" for
-        12-bit pixels in 3 bytes for 2.
+        12-bit pixels in 3 bytes for 2. `bad_pixels` [H, W] is not 0 at bad pixels.
         """
         given: Record = {
             "full_scale": full_scale,
@@ -188,6 +191,7 @@ class Client:
             "packing": packing,
             "mosaic": mosaic,
             "name": name,
+            "bad_pixels": None if bad_pixels is None else self.upload(bad_pixels),
         }
         record = self._create("calibrations", masks=self.upload(masks), **given)
         return Calibration(self, record).ready()
@@ -202,6 +206,7 @@ class Client:
         patterns: Source | None = None,
         saturation: int | None = None,
         mosaic: str | None = None,
+        bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Makes a calibration of raw captures, and waits until its masks are there.
@@ -217,7 +222,9 @@ class Client:
         }
         if black_with_mask is not None:
             captures["black_with_mask"] = self._uploads(black_with_mask)
-        return Calibration(self, self._create("calibrations", captures=captures, mosaic=mosaic, name=name)).ready()
+        given: Record = {"mosaic": mosaic, "name": name}
+        given["bad_pixels"] = None if bad_pixels is None else self.upload(bad_pixels)
+        return Calibration(self, self._create("calibrations", captures=captures, **given)).ready()
 
     def measure(
         self,
@@ -435,8 +442,12 @@ class Job(Entity):
     def verdict(self) -> str:
         """The grade of the frames, with the expected PSNR where it can be predicted."""
         if assessment := self.record.get("assessment"):
-            psnr, low, high = (assessment[key] for key in ("psnr_db", "psnr_low_db", "psnr_high_db"))
-            return f"{assessment['grade']}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
+            grade, psnr, low, high = (assessment[key] for key in ("grade", "psnr_db", "psnr_low_db", "psnr_high_db"))
+            if psnr is None:
+                return f"{grade}, no expected PSNR"
+            if psnr < 40:
+                return f"{grade}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
+            return f"{grade}, expected PSNR 40 dB or more" + (f" ({low:.1f} or more)" if low < 40 else "")
         return "bad" if any(finding["severity"] == "error" for finding in self.findings) else "not assessed"
 
     @property
@@ -536,7 +547,7 @@ class Result:
     @property
     def assessment(self) -> Record | None:
         """How good the frames are expected to be: `grade`, `psnr_db` between `psnr_low_db` and `psnr_high_db`, and `reasons`;
-        None where nothing can be told."""
+        None where nothing can be predicted. The figures are None where a finding puts scale, dark or masks in doubt."""
         return self.job.record.get("assessment")
 
     def expected_error(self, index: int) -> npt.NDArray[np.float32]:

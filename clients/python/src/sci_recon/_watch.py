@@ -152,6 +152,7 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
     calibration = client.calibrate(
         masks,
         mosaic=options.pop("mosaic", None),
+        bad_pixels=options.pop("bad_pixels", None),
         **{keyword: options.pop(option, None) for option, keyword in of_masks.items()},
     )
     of_job = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "label"}

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, Array3, Axis, s};
 
 use super::IntakeError;
+use super::bad_pixels::bad_pixels;
 use crate::intake::error::Result;
 use crate::job::{CalibrationReport, Captures, Finding, MAX_CALIBRATION_SECONDS, planned_seconds};
 use formats::planar::{self, Reader};
@@ -57,11 +58,12 @@ pub struct Report {
 /// Computes masks \[B,H,W\] on \[0,1\] from captures, and reports on them.
 ///
 /// The masks' scale is known only after the last one, so they are first written to `scratch`, an existing file. Then
-/// the normalised masks go to the writer that `open` returns. Returns the report and the output of the writer.
+/// the normalised masks go to the writer that `open` returns, with NaN where the map `bad` is not 0. Returns the report and
+/// the output of the writer.
 ///
 /// Errors: unreadable or unusable captures or patterns; I/O; [`IntakeError::Stopped`]; those of `open`.
 pub fn calibrate<W: Write>(
-    files: &CaptureFiles,
+    (files, bad): (&CaptureFiles, Option<&Path>),
     limits: &Limits,
     scratch: &Path,
     open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, FormatError>,
@@ -71,7 +73,10 @@ pub fn calibrate<W: Write>(
     let patterns = read_patterns(files, limits)?;
     let captured = average_masks(files, limits, scratch, progress)?;
     let raw = Reader::open(scratch, limits)?;
-    let masks = write_scaled(&raw, captured.scale, open(raw.info())?, progress)?;
+    let size = (raw.info().height, raw.info().width);
+    let bad = bad.map(|bad| bad_pixels(bad, size, limits)).transpose()?;
+    let to = open(raw.info())?;
+    let masks = write_scaled(&raw, captured.scale, bad.as_ref(), to, progress)?;
     let figures = study(&raw, captured.scale, progress)?;
     let report = report_on(&figures, Some(&captured), patterns.as_ref())?;
     let Captured { sample, clipped_negatives, .. } = captured;
@@ -244,10 +249,11 @@ fn normalise(masks: &mut Array3<f32>, scale: f32) {
     masks.mapv_inplace(|value| (value / scale).min(1.0));
 }
 
-/// Writes the normalised masks.
+/// Writes the normalised masks, NaN at bad pixels \[H,W\].
 fn write_scaled<W: Write>(
     raw: &Reader,
     scale: f32,
+    bad: Option<&Array2<bool>>,
     mut to: StackWriter<W>,
     progress: &mut Progress<'_>,
 ) -> Result<W> {
@@ -255,6 +261,14 @@ fn write_scaled<W: Write>(
     for frame in 0..frames {
         let mut mask = raw.read_window(frame..frame + 1, 0..height, 0..width)?;
         normalise(&mut mask, scale);
+        if let Some(bad) = bad {
+            let mut mask = mask.index_axis_mut(Axis(0), 0);
+            mask.zip_mut_with(bad, |mask, bad| {
+                if *bad {
+                    *mask = f32::NAN
+                }
+            });
+        }
         to.write_frame(mask.index_axis(Axis(0), 0))?;
         report_progress(progress, AVERAGING_SHARE + 0.1 * (frame + 1) as f64 / frames as f64)?;
     }
@@ -295,6 +309,8 @@ fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<Mask
         let end = rows.end;
         let mut band = masks.read_window(0..frames, rows, 0..width)?;
         normalise(&mut band, scale);
+        // Pixels that were not measured count as dark.
+        band.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
         study.add(band.view()).map_err(refused)?;
         report_progress(progress, 0.9 + 0.1 * end as f64 / height as f64)?;
     }

@@ -3,6 +3,7 @@
 //! The service (with uploads) and the commands (with paths) share this code. Stacks are read frame by frame and passed
 //! on to a writer, so memory holds a few planes.
 
+mod bad_pixels;
 mod captures;
 mod check;
 mod error;
@@ -12,8 +13,9 @@ mod refusal;
 mod report_page;
 mod sample;
 
+pub use bad_pixels::bad_pixels;
 pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
-pub use check::{Exposure, Passed, judge, masks, measurement};
+pub use check::{Behind, Exposure, Passed, combined, judge, masks, measurement};
 pub use error::IntakeError;
 pub use open::{Opened, Source};
 pub use read::{

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array3, ArrayView2, s};
 
 use super::IntakeError;
-use super::check::{Exposure, Passed, masks, measurement};
+use super::bad_pixels::bad_pixels;
+use super::check::{Behind, Exposure, Passed, masks, measurement};
 use super::open::{Opened, Source};
 use crate::intake::error::Result;
 use formats::mat::SceneArray;
@@ -23,14 +24,16 @@ pub struct Scaled<T> {
     pub axes: Option<Axes>,
 }
 
-/// Reads and checks masks \[B,H,W\] on \[0,1\].
+/// Reads and checks masks \[B,H,W\] on \[0,1\]. Pixels of the map of bad pixels, if there is one, become NaN.
 ///
 /// Errors: as [`masks`].
-pub fn read_masks(source: &Source<'_>) -> Result<Scaled<Array3<f32>>> {
+pub fn read_masks(source: &Source<'_>, bad: Option<&Path>) -> Result<Scaled<Array3<f32>>> {
     let opened = source.open()?;
     let (full_scale, axes) = (opened.full_scale.value(), opened.info.axes);
+    let size = (opened.info.height, opened.info.width);
+    let bad = bad.map(|bad| bad_pixels(bad, size, &source.limits)).transpose()?;
     let mut stack = Stack::default();
-    masks(opened, |mask| stack.push(mask))?;
+    masks(opened, bad.as_ref(), |mask| stack.push(mask))?;
     Ok(Scaled { array: stack.into_array()?, full_scale, axes })
 }
 
@@ -41,7 +44,7 @@ pub struct Snapshots {
     pub measurement: Scaled<Array3<f32>>,
     /// Number of snapshots in the file.
     pub count: usize,
-    /// Findings and saturation of these snapshots.
+    /// Findings on these snapshots.
     pub passed: Passed,
 }
 
@@ -51,6 +54,7 @@ pub struct Snapshots {
 pub fn read_snapshots(
     source: &Source<'_>,
     exposure: &Exposure,
+    behind: &Behind,
     (first, last): (usize, Option<usize>),
 ) -> Result<Snapshots> {
     let opened = source.open()?;
@@ -67,16 +71,15 @@ pub fn read_snapshots(
         return Err(IntakeError::content("", &detail));
     }
     let (mut next, mut selected) = (0, Stack::default());
-    let mut passed = measurement(opened, exposure, &source.limits, |snapshot| {
+    let mut passed = measurement(opened, exposure, behind, &source.limits, |snapshot| {
         if (first..=last).contains(&next) {
             selected.push(snapshot)?;
         }
         next += 1;
         Ok(())
     })?;
-    if let Some(shares) = &mut passed.saturated {
-        *shares = shares.get(first..=last).unwrap_or_default().to_vec();
-    }
+    let selects = |snapshot: u32| (first..=last).contains(&(snapshot as usize));
+    passed.findings.retain(|finding| finding.snapshot.is_none_or(selects));
     let measurement = Scaled { array: selected.into_array()?, full_scale, axes };
     Ok(Snapshots { measurement, count: snapshots, passed })
 }

@@ -19,7 +19,7 @@ mod text;
 
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
-pub use assessment::Assessment;
+pub use assessment::{Assessment, MaskOrder};
 pub use captures::{Captures, MAX_CALIBRATION_SECONDS, MAX_MASKS, planned_seconds};
 pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,

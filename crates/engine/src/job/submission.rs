@@ -44,6 +44,9 @@ pub struct CalibrationRequest {
     /// Colours of the sensor's pixels; a grey sensor has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mosaic: Option<Mosaic>,
+    /// A map of the size of the masks that is not 0 at bad pixels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bad_pixels: Option<Sha256>,
 }
 
 /// The body of `POST /v1/measurements`.
@@ -139,9 +142,11 @@ impl Submission {
     /// Each upload with its place in the request.
     pub fn uploads(&self) -> Vec<(String, Sha256)> {
         match self {
-            Self::Calibration(CalibrationRequest { masks, captures, .. }) => {
+            Self::Calibration(CalibrationRequest { masks, captures, bad_pixels, .. }) => {
                 let masks = masks.map(|masks| ("/masks".to_owned(), masks));
-                masks.into_iter().chain(captures.iter().flat_map(Captures::uploads)).collect()
+                let bad = bad_pixels.map(|map| ("/bad_pixels".to_owned(), map));
+                let captures = captures.iter().flat_map(Captures::uploads);
+                masks.into_iter().chain(captures).chain(bad).collect()
             }
             Self::Measurement(MeasurementRequest { data, dark, .. }) => {
                 let dark = dark.iter().enumerate();

@@ -28,11 +28,12 @@ pub const MIN_MOVIE_SIDE: usize = 16;
 /// The kind of a task. Snapshots are counted from 0 within the measurement, tiles from 0 within the tile plan.
 ///
 /// A job starts with prepare. Previews, the pilot (for an adaptive schedule or a sequence) and the tiles of all runs
-/// follow. A snapshot is assembled when the tiles of all runs that contain it are done. The manifest comes last.
+/// follow. When all tiles are done, the white level of the frames is determined, and the snapshots are assembled. The
+/// manifest comes last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, IntoStaticStr, VariantNames)]
 #[strum(serialize_all = "snake_case", const_into_str)]
 pub enum TaskKind {
-    /// Estimates the white level of the scene once per job, so that all tiles use the same one.
+    /// Estimates the scale of the solver once per job, so that all tiles use the same one.
     Prepare,
     /// Reconstructs one snapshot coarsely, for display until its tiles are done.
     Preview { snapshot: u32 },
@@ -47,6 +48,8 @@ pub enum TaskKind {
         snapshots: u32,
         tile: u32,
     },
+    /// Determines the white level of all frames, by which they are displayed and their errors are judged.
+    White,
     /// Blends the tiles of one snapshot and writes its frames.
     Assemble { snapshot: u32 },
     /// Writes the manifest of the job.
@@ -67,7 +70,12 @@ impl TaskKind {
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
             Self::Movie { snapshot } => snapshot,
-            Self::Prepare | Self::Pilot | Self::Manifest | Self::Check | Self::Calibration => None,
+            Self::Prepare
+            | Self::Pilot
+            | Self::White
+            | Self::Manifest
+            | Self::Check
+            | Self::Calibration => None,
         }
     }
 
@@ -94,6 +102,7 @@ impl TaskKind {
             Self::Check => true,
             Self::Prepare
             | Self::Preview { .. }
+            | Self::White
             | Self::Assemble { .. }
             | Self::Manifest
             | Self::Movie { .. } => cost <= LIGHT_S,
@@ -112,6 +121,7 @@ impl TaskKind {
             ("preview", Some(snapshot), None) => Some(Self::Preview { snapshot }),
             ("pilot", None, None) => Some(Self::Pilot),
             ("tile", Some(snapshot), Some(tile)) => Some(Self::Tile { snapshot, snapshots, tile }),
+            ("white", None, None) => Some(Self::White),
             ("assemble", Some(snapshot), None) => Some(Self::Assemble { snapshot }),
             ("manifest", None, None) => Some(Self::Manifest),
             ("check", None, None) => Some(Self::Check),
@@ -157,8 +167,7 @@ impl JobSpec {
             // The pilot follows the preview of the first snapshot; the other previews can wait.
             tasks.insert(2, (TaskKind::Pilot, voxels * (schedule_s + per_voxel * joints_s)));
         }
-        let mut assembled = self.snapshots.first;
-        for (index, run) in runs.runs().iter().enumerate() {
+        for run in runs.runs() {
             let (snapshot, snapshots) = (run.start as u32, run.len() as u32);
             let mut areas: Vec<_> = (0..).zip(tiles.tiles()).collect();
             areas.sort_by(|(a, _), (b, _)| work_order(*a).total_cmp(&work_order(*b)));
@@ -166,12 +175,11 @@ impl JobSpec {
                 let voxels = (area.height * area.width * run.len()) as f64 * frames;
                 tasks.push((TaskKind::Tile { snapshot, snapshots, tile }, voxels * per_voxel));
             }
-            // Snapshots that no later run contains are complete.
-            let complete = runs.runs().get(index + 1).map_or(run.end, |next| next.start) as u32;
-            let snapshots = std::mem::replace(&mut assembled, complete)..complete;
-            let assemble = |snapshot| (TaskKind::Assemble { snapshot }, pixels * frames * write_s);
-            tasks.extend(snapshots.map(assemble));
         }
+        let voxels = pixels * frames * f64::from(self.snapshots.count);
+        tasks.push((TaskKind::White, voxels * READ_S));
+        let assemble = |snapshot| (TaskKind::Assemble { snapshot }, pixels * frames * write_s);
+        tasks.extend(self.snapshots.indices().map(assemble));
         tasks.push((TaskKind::Manifest, 0.01));
         Ok(tasks)
     }

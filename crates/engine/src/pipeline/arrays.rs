@@ -40,13 +40,14 @@ impl Arrays {
         Reader::open(&self.masks.0, &Limits::default())
     }
 
-    /// The sum of all masks \[H,W\]. It reads one mask at a time.
+    /// The sum of all masks \[H,W\], in which pixels that were not measured count as 0. It reads one mask at a time.
     pub fn light(&self, monitor: &Monitor) -> Result<Array2<f32>> {
         let masks = self.masks()?;
         let mut light = Array2::zeros((masks.info().height, masks.info().width));
         for frame in 0..masks.info().frames {
             monitor.check()?;
-            light += &plane(&masks, frame)?;
+            light +=
+                &plane(&masks, frame)?.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         }
         Ok(light)
     }
@@ -69,6 +70,7 @@ impl Arrays {
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
         let y = window(&snapshots, frames, place)?;
         let masks = window(&masks, 0..masks.info().frames, place)?;
+        let masks = masks.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         let all_snapshots = 0..y.dim().0;
         Ok(TileInput { masks, y, white, pieces: vec![all_snapshots] })
     }

@@ -4,10 +4,12 @@
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
-use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
+use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, Severity};
 pub use reconstruction::assessment::{BLOCK, blocks};
 use reconstruction::assessment::{Evidence, Model, unfamiliar_masks};
+use reconstruction::hold_out::Prediction;
 use reconstruction::motion::fastest;
+use reconstruction::order::Order;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::RunShare;
 use reconstruction::solver::Outcome;
@@ -28,6 +30,12 @@ pub struct TileAssessment {
     /// True if predictions are unreliable behind the masks.
     #[serde(default)]
     unfamiliar: bool,
+    /// Prediction of the hold-out pixels, by this tile or by the pilot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    prediction: Option<Prediction>,
+    /// Order of the frames, by this tile or by the pilot.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    order: Option<Order>,
 }
 
 /// Number of levels per decibel.
@@ -47,9 +55,17 @@ impl TileAssessment {
             let (frames, height, width) = outcome.frames.dim();
             let size = blocks(height, width);
             let levels = vec![DARK; frames * size.0 * size.1];
-            return Some(Self { size, levels, motion: 0.0, unfamiliar: false });
+            return Some(Self {
+                size,
+                levels,
+                motion: 0.0,
+                unfamiliar: false,
+                prediction: None,
+                order: None,
+            });
         };
-        let errors = model.log_errors(features, outcome.evidence.as_ref().or(evidence), white);
+        let evidence = outcome.evidence.as_ref().or(evidence);
+        let errors = model.log_errors(features, evidence);
         let unfamiliar = unfamiliar_masks(features);
         let offset = if unfamiliar { model.unfamiliar.offset } else { 0.0 };
         let level = |error: &f32| {
@@ -58,7 +74,9 @@ impl TileAssessment {
         let (_, rows, columns) = errors.dim();
         let motion = fastest(outcome.frames.view(), white);
         let levels = errors.iter().map(level).collect();
-        Some(Self { size: (rows, columns), levels, motion, unfamiliar })
+        let prediction = evidence.and_then(|evidence| evidence.prediction);
+        let order = evidence.and_then(|evidence| evidence.order);
+        Some(Self { size: (rows, columns), levels, motion, unfamiliar, prediction, order })
     }
 
     /// True if it has a block structure that `frames` frames of `height` x `width` pixels can have.
@@ -99,21 +117,19 @@ pub struct Expected {
     pub error: Array3<f32>,
 }
 
-/// Largest reported PSNR in dB. Differences above it are not visible.
-const MAX_PSNR_DB: f64 = 40.0;
-
 /// Expected PSNR in dB from which frames are graded good.
 const GOOD_DB: f64 = 28.0;
 /// Frames are graded bad if the upper end of the interval is below this PSNR in dB.
 const BAD_DB: f64 = 22.0;
 
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
-/// with the assessments of its tiles in the plan's order. `None` if a tile has none, or if no tile has light.
+/// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
+/// of the PSNR. `None` if a tile has none, or if no tile has light.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
     schedule: &Schedule,
-    (frames, white): (usize, f32),
+    (frames, normalisation, white_level): (usize, f32, f32),
     warnings: &[Finding],
 ) -> Option<Expected> {
     let model = Model::of(schedule)?;
@@ -122,12 +138,15 @@ pub fn expected(
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
     let block_centre = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
     let (mut lit, mut motion, mut unfamiliar) = (false, 0.0f32, false);
+    let (mut predictions, mut orders) = (Vec::new(), Vec::new());
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
             lit |= !assessed.is_dark();
             motion = motion.max(assessed.motion);
             unfamiliar |= assessed.unfamiliar;
+            predictions.extend(assessed.prediction);
+            orders.extend(assessed.order);
             let weights = plan.weights(&tile);
             let inside = |at: usize, first: usize, length: usize| {
                 at.checked_sub(first).filter(|at| *at < length)
@@ -151,27 +170,109 @@ pub fn expected(
     if !lit {
         return None;
     }
-    let white = f64::from(white);
+    // Errors are on the unit scale of the solver.
+    let (unit, peak) = (f64::from(normalisation), f64::from(white_level));
     let psnr = |frame: ndarray::ArrayView2<'_, f64>| {
-        -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * white * white).log10()
+        -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * (unit / peak).powi(2)).log10()
     };
     let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
-    let bound = |offset: f64| (psnr_db + offset).min(MAX_PSNR_DB);
+    let bound = |offset: f64| (psnr_db + offset).min(Assessment::MAX_PSNR_DB);
     let interval = if unfamiliar { model.unfamiliar.interval } else { model.interval };
     let [low, high] = interval.map(bound);
-    let error = squares.mapv(|square| (square.sqrt() * white) as f32);
-    let psnr_db = psnr_db.min(MAX_PSNR_DB);
-    let mut reasons = reasons(&error, (psnr_db, white), warnings);
+    let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
+    let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);
+    let mut reasons = reasons(&error, (psnr_db, peak), warnings);
+    reasons.extend(unexplained_pixels(&predictions));
+    reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
     reasons.extend(unfamiliar.then(unfamiliar_masks_finding));
+    let stated = |decibels| (!is_in_doubt(&reasons)).then(|| Assessment::round(decibels));
     let assessment = Assessment {
         grade: grade((psnr_db, high), &reasons),
-        psnr_db: Assessment::round(psnr_db),
-        psnr_low_db: Assessment::round(low),
-        psnr_high_db: Assessment::round(high),
+        psnr_db: stated(psnr_db),
+        psnr_low_db: stated(low),
+        psnr_high_db: stated(high),
+        order: common_order(&orders),
         reasons,
     };
     Some(Expected { assessment, error })
+}
+
+/// True if a finding says that the scale of the masks, the dark, or the masks themselves may be wrong. The quality model
+/// knows only results with the right ones.
+fn is_in_doubt(findings: &[Finding]) -> bool {
+    use FindingCode::{
+        BadCalibration, ExchangedMasks, ForeignMasks, MaskScale, Mosaic, Negative, NegativeOffset,
+        NoDark, ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
+    };
+    const DOUBTS: [FindingCode; 12] = [
+        BadCalibration,
+        ExchangedMasks,
+        ForeignMasks,
+        MaskScale,
+        Mosaic,
+        Negative,
+        NegativeOffset,
+        NoDark,
+        ShiftedMasks,
+        TurnedMasks,
+        UnexplainedPixels,
+        WrongDark,
+    ];
+    // Where many pixels were not measured, the model does not know how many.
+    let lacks_pixels = |finding: &Finding| {
+        finding.severity == Severity::Error
+            && (finding.is(FindingCode::Saturated) || finding.is(FindingCode::BadPixels))
+    };
+    findings
+        .iter()
+        .any(|finding| lacks_pixels(finding) || DOUBTS.iter().any(|code| finding.is(*code)))
+}
+
+/// The order by the majority of the tiles that show it; `None` if there is no test.
+fn common_order(orders: &[Order]) -> Option<MaskOrder> {
+    let count = |is: fn(&Order) -> bool| orders.iter().filter(|order| is(order)).count();
+    let exchanged = count(|order| matches!(order, Order::Exchanged(..)));
+    let consistent = count(|order| *order == Order::Consistent);
+    match (exchanged, consistent) {
+        _ if orders.is_empty() => None,
+        (0, 0) => Some(MaskOrder::NotVerifiable),
+        _ if exchanged > consistent => Some(MaskOrder::Doubtful),
+        _ => Some(MaskOrder::Consistent),
+    }
+}
+
+/// Reports frames that follow one another much more steadily after an exchange.
+fn exchanged_masks(orders: &[Order]) -> Option<Finding> {
+    let pair = orders.iter().find_map(|order| match order {
+        Order::Exchanged(first, second) => Some((*first, *second)),
+        _ => None,
+    });
+    let (first, second) = pair.filter(|_| common_order(orders) == Some(MaskOrder::Doubtful))?;
+    let detail = format!(
+        "the frames would follow one another more steadily if frames {first} and {second} (counted from 0) were \
+         exchanged: the masks are probably in a wrong order"
+    );
+    let finding = Finding::new(FindingCode::ExchangedMasks, detail);
+    Some(Finding { frames: vec![first, second], ..finding })
+}
+
+/// Largest squared error of the frames' prediction of hold-out pixels, relative to the prediction by the pixels around
+/// them.
+const MAX_UNEXPLAINED: f64 = 1.0;
+
+/// Reports frames that predict hold-out pixels no better than the mean of the pixels around them.
+fn unexplained_pixels(predictions: &[Prediction]) -> Option<Finding> {
+    let sum = |value: fn(&Prediction) -> f64| predictions.iter().map(value).sum::<f64>();
+    let (frames, neighbours) = (sum(|one| one.by_frames), sum(|one| one.by_neighbours));
+    (neighbours > 0.0 && frames >= MAX_UNEXPLAINED * neighbours).then(|| {
+        let detail = format!(
+            "the frames predict pixels that were withheld from the reconstruction with {:.1} times the squared error \
+             of the mean of the pixels around them",
+            frames / neighbours
+        );
+        Finding::new(FindingCode::UnexplainedPixels, detail)
+    })
 }
 
 /// The grade of the expected PSNR, limited by the findings. Frames are graded bad only if the whole interval is below
@@ -196,23 +297,9 @@ fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
 /// A part of the picture is reported if its PSNR is this much below that of the whole picture, in dB.
 const UNEVEN_DB: f64 = 4.0;
 
-/// A white level below this share of the full scale indicates underexposure, or a wrong full scale.
-const MIN_WHITE_LEVEL: f64 = 0.12;
-
-/// The findings of the checks, an implausible white level, and the worst part of the picture.
-fn reasons(
-    error: &Array3<f32>,
-    (psnr_db, white): (f64, f64),
-    warnings: &[Finding],
-) -> Vec<Finding> {
+/// The findings of the checks, and the worst part of the picture. `peak` is the peak of the PSNR.
+fn reasons(error: &Array3<f32>, (psnr_db, peak): (f64, f64), warnings: &[Finding]) -> Vec<Finding> {
     let mut reasons = warnings.to_vec();
-    if white < MIN_WHITE_LEVEL && !reasons.iter().any(|reason| reason.is(FindingCode::Level)) {
-        let detail = format!(
-            "the brightest parts of the scene reach only {white:.3} of the full scale, so errors relative to the full \
-             scale look small"
-        );
-        reasons.push(Finding::new(FindingCode::Level, detail));
-    }
     let (_, rows, columns) = error.dim();
     if rows < 3 || columns < 3 {
         return reasons;
@@ -225,7 +312,7 @@ fn reasons(
         for (part_columns, name) in thirds(columns).into_iter().zip(names) {
             let part = error.slice(ndarray::s![.., part_rows.clone(), part_columns]);
             let mean = part.iter().map(|e| f64::from(*e).powi(2)).sum::<f64>() / part.len() as f64;
-            let decibels = -10.0 * mean.max(1e-12).log10();
+            let decibels = -10.0 * (mean / peak.powi(2)).max(1e-12).log10();
             if decibels < worst_db {
                 (worst_db, worst_part) = (decibels, name);
             }
@@ -270,7 +357,7 @@ const PARTS: [[&str; 3]; 3] = [
 
 #[cfg(test)]
 mod tests {
-    use super::{DARK, TileAssessment, expected, grade};
+    use super::{DARK, Prediction, TileAssessment, expected, grade};
     use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
     use reconstruction::schedule::Schedule;
     use reconstruction::sequence::SequencePlan;
@@ -296,7 +383,14 @@ mod tests {
     /// A tile of 2 frames of 32x32 pixels with this expected PSNR.
     fn tile(decibels: u8) -> TileAssessment {
         let (levels, motion) = (vec![4 * decibels; 8], 4.0);
-        TileAssessment { size: (2, 2), levels, motion, unfamiliar: false }
+        TileAssessment {
+            size: (2, 2),
+            levels,
+            motion,
+            unfamiliar: false,
+            prediction: None,
+            order: None,
+        }
     }
 
     #[test]
@@ -318,11 +412,11 @@ mod tests {
         let plan = TilePlan::new(48, 48, 32, 16).unwrap();
         assert_eq!(plan.len(), 4);
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
-        let assess_at = |white, tiles: Vec<Option<TileAssessment>>| {
+        let assess_at = |peak, tiles: Vec<Option<TileAssessment>>| {
             let shares = [(shares[0].clone(), tiles)];
-            expected(&plan, &shares, &Schedule::gap_tv(), (2, white), &[])
+            expected(&plan, &shares, &Schedule::gap_tv(), (2, 0.5, peak), &[])
         };
-        let assess = |tiles| assess_at(0.5, tiles);
+        let assess = |tiles| assess_at(1.0, tiles);
         let tiles =
             |decibels: [u8; 4]| -> Vec<_> { decibels.map(|level| Some(tile(level))).into() };
         let even = assess(tiles([25; 4])).unwrap();
@@ -335,13 +429,26 @@ mod tests {
         );
         // The predicted PSNR is the mean of the map.
         let rms = -20.0 * f64::from(first).log10();
-        assert!((rms - even.assessment.psnr_db).abs() < 0.06, "{rms}: {:?}", even.assessment);
+        let psnr = even.assessment.psnr_db.unwrap();
+        assert!((rms - psnr).abs() < 0.06, "{rms}: {:?}", even.assessment);
         assert!(even.assessment.reasons.is_empty());
         let uneven = assess(tiles([15, 35, 35, 35])).unwrap().assessment;
         assert!(uneven.reasons[0].detail.starts_with("the top left"), "{uneven:?}");
-        // With a full scale that is ten times too large all errors look small.
-        let dim = assess_at(0.05, tiles([25; 4])).unwrap().assessment;
-        assert_eq!((dim.reasons[0].code.as_str(), dim.grade), ("level", Grade::Usable), "{dim:?}");
+        // The PSNR is relative to the white level.
+        let dim = assess_at(0.1, tiles([25; 4])).unwrap();
+        assert!((psnr - dim.assessment.psnr_db.unwrap() - 20.0).abs() < 0.06, "{dim:?}");
+        assert_eq!(dim.error, even.error);
+        // Frames that predict hold-out pixels worse than the pixels around them are bad, and get no figure.
+        let predicted = |by_frames| {
+            let prediction = Some(Prediction { by_frames, by_neighbours: 2.0 });
+            let tiles = tiles([35; 4]).into_iter().flatten();
+            let tiles = tiles.map(|tile| Some(TileAssessment { prediction, ..tile })).collect();
+            assess(tiles).unwrap().assessment
+        };
+        assert_eq!(predicted(1.0).grade, Grade::Good);
+        let unexplained = predicted(2.0);
+        assert_eq!((unexplained.grade, unexplained.psnr_db), (Grade::Bad, None));
+        assert_eq!(unexplained.reasons[0].code, "unexplained_pixels");
         // One moving tile suffices.
         let mut fast = tiles([25; 4]);
         fast[1] = fast[1].clone().map(|tile| TileAssessment { motion: 8.6, ..tile });
@@ -356,14 +463,22 @@ mod tests {
             (other.reasons[0].code.as_str(), other.grade),
             ("unfamiliar_masks", Grade::Usable)
         );
-        assert!(other.psnr_db - other.psnr_low_db > 5.9, "{other:?}");
+        let below = other.psnr_db.zip(other.psnr_low_db).map(|(psnr, low)| psnr - low);
+        assert!(below > Some(5.9), "{other:?}");
         // Without the assessment of one tile there is none of the snapshot.
         let mut incomplete = tiles([25; 4]);
         incomplete[2] = None;
         assert!(assess(incomplete).is_none());
         // Tiles without light do not contribute.
         let (levels, motion) = (vec![DARK; 8], 0.0);
-        let dark = TileAssessment { size: (2, 2), levels, motion, unfamiliar: false };
+        let dark = TileAssessment {
+            size: (2, 2),
+            levels,
+            motion,
+            unfamiliar: false,
+            prediction: None,
+            order: None,
+        };
         assert!(assess(vec![Some(dark.clone()); 4]).is_none());
         let mut lit = tiles([25; 4]);
         lit[3] = Some(dark);
@@ -375,15 +490,19 @@ mod tests {
     fn jobs_get_the_grade_of_their_worst_snapshot() {
         let one = |psnr_db, grade, reasons: &[Finding]| Assessment {
             grade,
-            psnr_db,
-            psnr_low_db: psnr_db - 3.0,
-            psnr_high_db: psnr_db + 3.0,
+            psnr_db: Some(psnr_db),
+            psnr_low_db: Some(psnr_db - 3.0),
+            psnr_high_db: Some(psnr_db + 3.0),
+            order: None,
             reasons: reasons.to_vec(),
         };
         let warned = [finding(Severity::Warning)];
         let all = [one(30.0, Grade::Good, &warned), one(20.05, Grade::Bad, &warned)];
         let job = Assessment::combined(all.iter().map(Some)).unwrap();
-        assert_eq!((job.grade, job.psnr_db, job.reasons.len()), (Grade::Bad, 25.0, 1));
+        assert_eq!((job.grade, job.psnr_db, job.reasons.len()), (Grade::Bad, Some(25.0), 1));
+        let withheld = Assessment { psnr_db: None, ..all[0].clone() };
+        let job = Assessment::combined([Some(&withheld), Some(&all[1])].into_iter()).unwrap();
+        assert_eq!((job.psnr_db, job.psnr_low_db), (None, Some(22.0)));
         assert_eq!(Assessment::combined([Some(&all[0]), None].into_iter()), None);
         assert_eq!(Assessment::combined(std::iter::empty()), None);
     }

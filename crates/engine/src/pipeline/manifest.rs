@@ -110,7 +110,7 @@ impl Recipe {
         if self.shape.mosaic.is_some() {
             return None;
         }
-        let scale = (self.shape.frames, self.scale.white);
+        let scale = (self.shape.frames, self.scale.normalisation, self.scale.white_level);
         expected(&self.tile_plan, shares, &self.schedule, scale, &self.warnings_of(snapshot))
     }
 
@@ -221,15 +221,18 @@ pub struct Inputs {
 }
 
 /// All factors between stored values and the unit scale of the solver. Frames are on the scale of the measurement
-/// divided by its full scale: the white level is undone. The full scale of the masks defines a mask value of 1.
+/// divided by its full scale: the normalisation is undone. The full scale of the masks defines a mask value of 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ScaleRecord {
     /// Stored mask value that means 1.
     pub masks_full_scale: f32,
     /// Stored measurement value that means 1.
     pub measurement_full_scale: f32,
-    /// White level of the scene, estimated once per job. The solver works on frames divided by it.
-    pub white: f32,
+    /// Brightness that the solver takes for 1, estimated once per job from the measurement.
+    pub normalisation: f32,
+    /// The 99.9th percentile of all frames of the job: the peak of the expected PSNR, and the value that pictures show
+    /// as white.
+    pub white_level: f32,
 }
 
 /// The timing of the camera.
@@ -320,7 +323,7 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
         ("snapshot".to_owned(), content.snapshot.to_string()),
         ("masksSha256".to_owned(), recipe.inputs.masks_sha256.to_string()),
         ("measurementSha256".to_owned(), recipe.inputs.measurement_sha256.to_string()),
-        ("whiteLevel".to_owned(), recipe.scale.white.to_string()),
+        ("whiteLevel".to_owned(), recipe.scale.white_level.to_string()),
     ];
     if let Some(mosaic) = recipe.shape.mosaic {
         shared.push(("mosaic".to_owned(), mosaic.to_string()));
@@ -361,7 +364,12 @@ pub(super) fn sample(frames: usize) -> Manifest {
             measurement_axes: Some("frame-row-column".to_owned()),
         },
         models: ModelRecord::of(&Algorithm::PnpTvFastdvdnet.default_schedule()),
-        scale: ScaleRecord { masks_full_scale: 1.0, measurement_full_scale: 255.0, white: 0.9 },
+        scale: ScaleRecord {
+            masks_full_scale: 1.0,
+            measurement_full_scale: 255.0,
+            normalisation: 0.8,
+            white_level: 0.9,
+        },
         tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),
         runs: SequencePlan::separate(0..2),
         warnings: Vec::new(),

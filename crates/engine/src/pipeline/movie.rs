@@ -5,6 +5,7 @@ use std::io::{BufWriter, Seek, Write};
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Axis, s};
+use serde::{Deserialize, Serialize};
 
 use super::error::{PipelineError, Result};
 use super::progress::Monitor;
@@ -16,12 +17,21 @@ const NAME: &str = "movie.mp4";
 /// Number of samples that are read at a time: 16 MiB.
 const BAND_SAMPLES: usize = 4 << 20;
 
+/// The values that a picture shows as black and as white.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DisplayWindow {
+    pub black: f32,
+    pub white: f32,
+}
+
 /// The input of a movie.
 #[derive(Debug)]
 pub struct MovieTask {
     pub shape: SceneShape,
-    /// Value that is displayed as white; 0 is black, as in the PNGs of the frames.
-    pub white: f32,
+    /// Values that are displayed as black and as white.
+    pub window: DisplayWindow,
+    /// True if the window was requested instead of the job's white level.
+    pub requested: bool,
     /// Frames per second of the scene, if known.
     pub scene_fps: Option<f64>,
     /// The file `frames.npy` of each snapshot, and its recorded hash.
@@ -52,7 +62,7 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
         let reader = open_checked(array, *sha256)?;
         monitor.check()?;
         for k in 0..frames {
-            write_frame(&mut writer, &reader, k, (channels, step, task.white))?;
+            write_frame(&mut writer, &reader, k, (channels, step, task.window))?;
             monitor.check()?;
             let done = (index * frames + k + 1) as f64 / count as f64;
             monitor.reach(TaskStage::Writing, done);
@@ -78,8 +88,9 @@ fn write_frame<W: Write + Seek>(
     writer: &mut MovieWriter<W>,
     reader: &WindowReader,
     k: usize,
-    (channels, step, white): (Channels, usize, f32),
+    (channels, step, window): (Channels, usize, DisplayWindow),
 ) -> Result<()> {
+    let DisplayWindow { black, white } = window;
     let (height, samples) = (reader.info().height, reader.info().width);
     let width = samples / channels.count();
     let size = (height.div_ceil(step), width.div_ceil(step) * channels.count());
@@ -90,7 +101,7 @@ fn write_frame<W: Write + Seek>(
         let rows = start * step..(end * step).min(height);
         let values = reader.read_window(k..k + 1, rows, 0..samples)?;
         let values = block_means(values.index_axis_move(Axis(0), 0), channels, step);
-        levels.slice_mut(s![start..end, ..]).assign(&values.map(png::level_u8(0.0, white)));
+        levels.slice_mut(s![start..end, ..]).assign(&values.map(png::level_u8(black, white)));
     }
     Ok(writer.write_frame(levels.view())?)
 }
@@ -119,7 +130,7 @@ mod tests {
     use shiguredo_mp4::boxes::SampleEntry;
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-    use super::{MovieTask, block_means, write};
+    use super::{DisplayWindow, MovieTask, block_means, write};
     use crate::job::{SceneShape, Sha256};
     use crate::pipeline::PipelineError;
     use crate::pipeline::progress::Monitor;
@@ -135,7 +146,8 @@ mod tests {
         let shape = SceneShape { frames: 2, height: 77, width: 3841, snapshots: 2, mosaic: None };
         let task = |sha256| MovieTask {
             shape,
-            white: 4.0,
+            window: DisplayWindow { black: 0.0, white: 4.0 },
+            requested: false,
             scene_fps: Some(100.0),
             clips: vec![(array.clone(), sha256); 2],
         };

@@ -11,7 +11,8 @@ use reconstruction::{ReconError, metrics};
 pub struct FrameQuality {
     /// Number of the frame, counted from 1.
     pub frame: usize,
-    /// PSNR in dB; infinite, and null in JSON, if the frame equals its truth.
+    /// PSNR in dB for a data range of 1, unless it was set [relative to](Quality::relative_to) another peak; infinite, and
+    /// null in JSON, if the frame equals its truth.
     #[schemars(with = "Option<f64>")]
     pub psnr: f64,
     /// SSIM; `None` if the frame is smaller than the SSIM window.
@@ -64,6 +65,17 @@ impl Quality {
         let frames = truth.outer_iter().enumerate();
         let frames = frames.map(|(k, truth)| FrameQuality::of(k, frame(k).view(), truth, channels));
         Ok(frames.collect::<Result<Vec<_>, _>>()?.into())
+    }
+}
+
+impl Quality {
+    /// Makes the PSNR relative to another peak than 1.
+    #[must_use]
+    pub fn relative_to(mut self, peak: f32) -> Self {
+        let gain = 20.0 * f64::from(peak).log10();
+        self.psnr += gain;
+        self.frames.iter_mut().for_each(|frame| frame.psnr += gain);
+        self
     }
 }
 

@@ -13,8 +13,15 @@ use reconstruction::solver::Outcome;
 /// The record of the task that prepares a job.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct PreparedRecord {
-    /// White level of the scene, for all snapshots and tiles of the job.
+    /// The solver's scale, for all snapshots and tiles of the job.
     pub white: f32,
+}
+
+/// The record of the task that determines the white level of a job.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub struct WhiteRecord {
+    /// The 99.9th percentile of all frames.
+    pub white_level: f32,
 }
 
 /// The decisions of a job's pilot.

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use ndarray::{Array2, ArrayView3};
 
-/// Relative residual `||y - H v|| / ||y||` of a run of snapshots: the largest of its pieces, at most
+/// Relative residual `||y - H v|| / ||y||` over the measured pixels (others are NaN) of a run of snapshots: the largest of its pieces, at most
 /// [`f32::MAX`]. It is 0 behind masks that let no light through.
 ///
 /// Takes masks \[B,h,w\], the measurement \[S,h,w\], and ranges of snapshots as pieces. `frame` returns one of the
@@ -27,12 +27,15 @@ pub fn residual<E>(
     for piece in pieces {
         let (mut rest_squares, mut y_squares) = (0.0f64, 0.0f64);
         for (snapshot, y) in y.outer_iter().enumerate().filter(|(s, _)| piece.contains(s)) {
-            let mut rest = y.mapv(f64::from);
+            let is_measured = y.mapv(|y| !y.is_nan());
+            let mut rest = y.mapv(|y| if y.is_nan() { 0.0 } else { f64::from(y) });
             y_squares += squares(&rest);
             for (k, mask) in masks.outer_iter().enumerate() {
                 let frame = frame(snapshot * frames + k)?;
-                ndarray::azip!((rest in &mut rest, &c in &mask, &x in &frame) {
-                    *rest -= f64::from(c) * f64::from(x);
+                ndarray::azip!((rest in &mut rest, &c in &mask, &x in &frame, &measured in &is_measured) {
+                    if measured {
+                        *rest -= f64::from(c) * f64::from(x);
+                    }
                 });
             }
             rest_squares += squares(&rest);

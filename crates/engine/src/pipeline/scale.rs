@@ -1,4 +1,4 @@
-//! Estimation of the white level that all tiles of a job share.
+//! The two scales of a job: that of the solver, which all tiles share, and the white level of the frames, for people.
 
 use ndarray::{ArrayView3, Axis};
 
@@ -9,23 +9,24 @@ use crate::job::SnapshotRange;
 use reconstruction::ReconError;
 use reconstruction::scale::ScaleEstimator;
 
-/// The white level of snapshots \[S,H,W\] behind masks \[B,H,W\], both in memory.
+/// The solver's scale for snapshots \[S,H,W\] behind masks \[B,H,W\], both in memory.
 ///
 /// Errors: those of [`ScaleEstimator::white`]; [`ReconError::Shape`] without snapshots.
 pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
     let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
     let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
+    let whites = lit_snapshots(whites)?;
     let no_snapshots = || ReconError::Shape {
         what: "the measurement",
         found: "no snapshots".into(),
         expected: "at least one".into(),
     };
-    median_white(whites.collect::<Result<_, _>>()?).ok_or_else(no_snapshots)
+    median_white(whites).ok_or_else(no_snapshots)
 }
 
-/// The white level of the stored snapshots of a job. It reads one plane at a time.
+/// The solver's scale for the stored snapshots of a job. It reads one plane at a time. Snapshots without light do not count.
 ///
-/// Errors: those of reading and of [`ScaleEstimator::white`]; a stop by the monitor.
+/// Errors: those of reading, and of [`ScaleEstimator::white`] if no snapshot has light; a stop by the monitor.
 pub fn job_white_level(
     arrays: &Arrays,
     snapshots: SnapshotRange,
@@ -36,11 +37,30 @@ pub fn job_white_level(
     for snapshot in snapshots.indices() {
         monitor.check()?;
         let white = estimator.white(arrays.snapshot(snapshot)?.view());
-        whites.push(white.map_err(|source| PipelineError::Snapshot { snapshot, source })?);
+        whites.push(white.map_err(|source| PipelineError::Snapshot { snapshot, source }));
     }
+    let whites = lit_snapshots(whites)?;
     let no_snapshots =
         || PipelineError::Record { what: "job", problem: "it has no snapshots".into() };
     median_white(whites).ok_or_else(no_snapshots)
+}
+
+/// The values of snapshots with light.
+///
+/// # Errors
+/// The last error, if there are only errors.
+fn lit_snapshots<E>(whites: impl IntoIterator<Item = Result<f32, E>>) -> Result<Vec<f32>, E> {
+    let (mut lit, mut failure) = (Vec::new(), None);
+    for white in whites {
+        match white {
+            Ok(white) => lit.push(white),
+            Err(error) => failure = Some(error),
+        }
+    }
+    match failure {
+        Some(error) if lit.is_empty() => Err(error),
+        _ => Ok(lit),
+    }
 }
 
 /// The median (the lower one of two) of the snapshots' white levels; `None` without snapshots. Unlike the maximum, the
@@ -51,9 +71,82 @@ fn median_white(mut whites: Vec<f32>) -> Option<f32> {
     whites.get(middle).copied()
 }
 
+/// Share of a job's samples at or below its white level.
+const WHITE_QUANTILE: f64 = 0.999;
+/// Bits of a sample that select its bin: the exponent and 11 bits of the mantissa, a bin width of 0.05 %.
+const BIN_BITS: u32 = 19;
+
+/// Histogram of the samples of frames, from which their white level follows.
+///
+/// The order of the samples does not matter, so the white level is the same for all cuts into tasks.
+#[derive(Debug)]
+pub struct Histogram {
+    /// Number of samples above 0 in each bin.
+    counts: Vec<u64>,
+    /// Number of finite samples.
+    total: u64,
+}
+
+impl Default for Histogram {
+    fn default() -> Self {
+        Self { counts: vec![0; 1 << BIN_BITS], total: 0 }
+    }
+}
+
+impl Histogram {
+    /// Adds the finite ones of some samples.
+    pub fn add<'a>(&mut self, samples: impl IntoIterator<Item = &'a f32>) {
+        for sample in samples.into_iter().filter(|sample| sample.is_finite()) {
+            self.total += 1;
+            if *sample > 0.0 {
+                self.counts[(sample.to_bits() >> (31 - BIN_BITS)) as usize] += 1;
+            }
+        }
+    }
+
+    /// The 99.9th percentile of the samples, to 0.05 %; `None` unless it is above 0.
+    #[allow(clippy::cast_precision_loss)] // counts far below 2^53
+    pub fn white_level(&self) -> Option<f32> {
+        let above = self.total as f64 * (1.0 - WHITE_QUANTILE);
+        let mut count = 0;
+        let bin = self.counts.iter().enumerate().rev().find(|(_, samples)| {
+            count += **samples;
+            count as f64 > above
+        });
+        let shift = 31 - BIN_BITS;
+        // The middle of the bin.
+        bin.map(|(bin, _)| f32::from_bits(((bin as u32) << shift) | 1 << (shift - 1)))
+    }
+}
+
+/// The white level of the frames of a job from their histogram; the solver's scale if they are dark.
+pub fn white_level(histogram: &Histogram, solver_white: f32) -> f32 {
+    histogram.white_level().unwrap_or(solver_white)
+}
+
 #[cfg(test)]
 mod tests {
-    use super::median_white;
+    use super::{Histogram, median_white};
+
+    #[test]
+    fn white_levels_do_not_depend_on_order_and_unit() {
+        let samples: Vec<f32> = (0..10_000).map(|k| (k * 7919 % 10_000) as f32 / 1e4).collect();
+        let white = |scale: f32| {
+            let (mut whole, mut parts) = (Histogram::default(), Histogram::default());
+            let scaled: Vec<f32> = samples.iter().map(|sample| sample * scale).collect();
+            whole.add(&scaled);
+            scaled.chunks(77).rev().for_each(|part| parts.add(part));
+            assert_eq!(whole.white_level(), parts.white_level());
+            whole.white_level().unwrap()
+        };
+        for scale in [1.0, 1.0 / 3.0, 4095.0, 1e-6] {
+            let level = white(scale) / scale;
+            assert!((level - 0.999).abs() < 1e-3, "{scale}: {level}");
+        }
+        let mut dark = Histogram::default();
+        dark.add(&[0.0, -1.0, f32::NAN]);
+        assert_eq!(dark.white_level(), None);
+    }
 
     #[test]
     fn single_flashes_do_not_set_the_scale() {

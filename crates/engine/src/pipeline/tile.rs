@@ -13,13 +13,14 @@ use reconstruction::operator::SensingOperator;
 use reconstruction::priors::Networks;
 use reconstruction::schedule::Schedule;
 use reconstruction::solver::{self, Observer, Outcome, StopReason};
+use reconstruction::unmeasured::filled;
 
 /// The input of a tile.
 #[derive(Debug, Clone)]
 pub struct TileInput {
-    /// Window of the masks \[B,h,w\] on \[0,1\].
+    /// Window of the masks \[B,h,w\] on \[0,1\]; NaN were not measured, and neither were the snapshots there.
     pub masks: Array3<f32>,
-    /// Window of a run of snapshots \[S,h,w\].
+    /// Window of a run of snapshots \[S,h,w\]; NaN were not measured.
     pub y: Array3<f32>,
     /// White level of the scene, above 0. It is the same for all tiles of a job, so that no seams appear.
     pub white: f32,
@@ -51,7 +52,8 @@ impl TileInput {
                 expected: "non-empty pieces of these snapshots".into(),
             });
         }
-        let op = match SensingOperator::new(self.masks) {
+        let masks = self.masks.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+        let op = match SensingOperator::new(masks) {
             Err(ReconError::DarkMasks { .. }) => return Ok(None),
             other => other?,
         };
@@ -165,7 +167,8 @@ pub fn run_network(
         Ok(Outcome {
             features: None,
             evidence: None,
-            frames: network.frames(y.index_axis(Axis(0), 0), op.masks())?,
+            // Networks know no missing pixels.
+            frames: network.frames(filled(y.index_axis(Axis(0), 0)).view(), op.masks())?,
             iterations: 0,
             tv_iterations: 0,
             denoiser_passes: 1,

@@ -52,7 +52,7 @@ pub fn write_result(
     }
     let attributes = frame_attributes(&manifest.content);
     let (height, width) = (manifest.content.height, manifest.content.width);
-    let (count, white) = (manifest.content.frames, manifest.content.recipe.scale.white);
+    let (count, white) = (manifest.content.frames, manifest.content.recipe.scale.white_level);
     let array = BufWriter::new(File::create(folder.join(ARRAY)).map_err(failed(ARRAY))?);
     let shape = manifest.content.recipe.shape;
     let channels = shape.channels();

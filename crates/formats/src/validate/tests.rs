@@ -108,9 +108,10 @@ fn only_rounding_above_one_is_tolerated() {
 }
 
 #[test]
-fn nan_infinities_and_zero_masks_are_refused() {
-    let error = masks(array![[[0.5, 0.5]], [[0.5, f32::NAN]]], 1.0).unwrap_err();
-    assert_names(&error.to_string(), &["NaN", "frame 1, row 0, column 1"]);
+fn infinities_and_zero_masks_are_refused_and_nan_are_kept() {
+    let (statistics, scaled) = masks(array![[[0.5, 0.5]], [[0.5, f32::NAN]]], 1.0).unwrap();
+    assert!(scaled[[1, 0, 1]].is_nan() && scaled[[0, 0, 1]] == 0.5);
+    assert!((statistics.mean - 1.5 / 4.0).abs() < 1e-7);
     let error = masks(array![[[f32::NEG_INFINITY, 0.5]]], 1.0).unwrap_err();
     assert_names(&error.to_string(), &["-inf", "frame 0, row 0, column 0"]);
     let error = masks(array![[[0.0, -1.0]], [[0.0, 0.0]]], 1.0).unwrap_err();
@@ -132,9 +133,11 @@ fn measurements_may_be_negative_and_above_one() {
 }
 
 #[test]
-fn empty_snapshots_and_nan_are_refused() {
-    let error = measurement(array![[[1.0]], [[0.0]]], 1.0).unwrap_err();
-    assert_names(&error.to_string(), &["snapshot 1 of 2", "zero everywhere"]);
+fn measurements_without_light_and_infinities_are_refused() {
+    let error = measurement(array![[[0.0]], [[f32::NAN]]], 1.0).unwrap_err();
+    assert_names(&error.to_string(), &["snapshot 0 of 2", "zero everywhere"]);
+    let kept = measurement(array![[[1.0]], [[0.0]], [[f32::NAN]]], 1.0).unwrap();
+    assert!(kept[[1, 0, 0]] == 0.0 && kept[[2, 0, 0]].is_nan());
     let error = measurement(array![[[1.0, f32::INFINITY]]], 1.0).unwrap_err();
     assert_names(&error.to_string(), &["measurement", "inf", "column 1"]);
 }

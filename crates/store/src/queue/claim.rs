@@ -56,7 +56,10 @@ pub struct JobTask {
     pub prepared: Option<Value>,
     /// Record of its pilot, if it has one that is done.
     pub pilot: Option<Value>,
-    /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan.
+    /// The record of its white level, once that is determined.
+    pub white: Option<Value>,
+    /// For an assembly: all tiles of the runs that hold its snapshot, in the order of the plan. For the white level: all
+    /// tiles of the job, without their assessments.
     pub tiles: Vec<TileResult>,
     /// For the manifest: all other tasks of the job, in order.
     pub records: Vec<TaskRecord>,
@@ -76,6 +79,8 @@ pub struct CalibrationTask {
     pub calibration: CalibrationId,
     /// Captures to compute masks from; `None` if only a report on existing masks is wanted.
     pub captures: Option<Captures>,
+    /// A map of bad pixels, for masks that are made of captures.
+    pub bad_pixels: Option<Sha256>,
     /// The masks, a planar array, if they exist.
     pub masks: Option<Sha256>,
 }
@@ -86,8 +91,10 @@ pub struct MovieWork {
     pub job: JobId,
     pub spec: JobSpec,
     pub measurement: Measurement,
-    /// Record of the job's prepare task.
-    pub prepared: Option<Value>,
+    /// The record of the job's white level.
+    pub white: Option<Value>,
+    /// The values to show as black and as white, if they were requested.
+    pub window: Option<Value>,
     /// The array with the frames of each snapshot, and its recorded hash.
     pub arrays: Vec<(PathBuf, Sha256)>,
 }
@@ -296,22 +303,25 @@ impl Store {
         let facts = sql_as!(
             "SELECT spec,
                  (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'prepare') AS prepared,
-                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'pilot') AS pilot,
+                 (SELECT record FROM tasks WHERE job = jobs.id AND kind = 'white') AS white
              FROM jobs WHERE id = ?",
             [job]
         );
         type Record = Option<Json<Value>>;
-        let (Json(spec), prepared, pilot): (Json<JobSpec>, Record, Record) =
+        let (Json(spec), prepared, pilot, white): (Json<JobSpec>, Record, Record, Record) =
             facts.fetch_one(&self.readers).await?;
         let calibration = self.find_calibration(None, spec.calibration).await?;
         let measurement = self.find_measurement(None, spec.measurement).await?;
         let (mut tiles, mut records) = (Vec::new(), Vec::new());
         match kind {
             TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
+            TaskKind::White => tiles = self.all_tile_results(job).await?,
             TaskKind::Manifest => records = self.task_records(job).await?,
             _ => {}
         }
-        let (prepared, pilot) = (prepared.map(|json| json.0), pilot.map(|json| json.0));
+        let [prepared, pilot, white] =
+            [prepared, pilot, white].map(|record| record.map(|json| json.0));
         Ok(Work::Job(Box::new(JobTask {
             job,
             spec,
@@ -319,6 +329,7 @@ impl Store {
             measurement,
             prepared,
             pilot,
+            white,
             tiles,
             records,
         })))
@@ -327,10 +338,11 @@ impl Store {
     async fn movie_work(&self, job: JobId, snapshot: Option<u32>) -> Result<Work> {
         let job = self.job_of_any_lab(job).await?;
         let measurement = self.find_measurement(None, job.spec.measurement).await?;
-        let prepared: Option<Json<Value>> =
-            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'prepare'", [job.id])
+        let white: Option<Json<Value>> =
+            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job.id])
                 .fetch_one(&self.readers)
                 .await?;
+        let window = self.movie_window(job.id, snapshot).await?;
         let mut arrays = Vec::new();
         for snapshot in
             snapshot.map_or_else(|| job.spec.snapshots.indices().collect(), |one| vec![one])
@@ -338,8 +350,8 @@ impl Store {
             let (file, path) = self.result_file(&job, Some(snapshot), "frames.npy").await?;
             arrays.push((path, file.sha256));
         }
-        let prepared = prepared.map(|json| json.0);
-        let work = MovieWork { job: job.id, spec: job.spec, measurement, prepared, arrays };
+        let white = white.map(|json| json.0);
+        let work = MovieWork { job: job.id, spec: job.spec, measurement, white, window, arrays };
         Ok(Work::Movie(Box::new(work)))
     }
 
@@ -360,11 +372,12 @@ impl Store {
         let request = requests::find(&mut connection, id.into()).await?;
         let masks = sql_as!("SELECT prepared FROM calibrations WHERE id = ?", [id]);
         let masks = masks.fetch_optional(&mut *connection).await?;
-        let captures = match request.submission {
-            Submission::Calibration(request) => request.captures,
-            Submission::Measurement(_) | Submission::Model(_) => None,
+        let (captures, bad_pixels) = match request.submission {
+            Submission::Calibration(request) => (request.captures, request.bad_pixels),
+            Submission::Measurement(_) | Submission::Model(_) => (None, None),
         };
-        Ok(Work::Calibration(Box::new(CalibrationTask { calibration: id, captures, masks })))
+        let task = CalibrationTask { calibration: id, captures, bad_pixels, masks };
+        Ok(Work::Calibration(Box::new(task)))
     }
 }
 

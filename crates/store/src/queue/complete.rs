@@ -33,7 +33,7 @@ pub struct Completion {
 
 #[derive(Debug)]
 pub enum Product {
-    /// Nothing but its record (prepare).
+    /// Nothing but its record (prepare, white).
     Record,
     /// The share of their planned cost that the tiles still have, on \[0,1\] (pilot).
     TileCost(f64),

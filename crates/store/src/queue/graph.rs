@@ -101,6 +101,7 @@ fn first_state(kind: TaskKind) -> TaskState {
         TaskKind::Preview { .. }
         | TaskKind::Pilot
         | TaskKind::Tile { .. }
+        | TaskKind::White
         | TaskKind::Assemble { .. }
         | TaskKind::Manifest => TaskState::Blocked,
     }
@@ -136,14 +137,18 @@ pub(super) async fn unblock(
         TaskKind::Pilot => {
             "UPDATE tasks SET state = ?4 WHERE job = ?1 AND kind = 'tile' AND state = ?3"
         }
-        TaskKind::Tile { .. } => {
-            // A snapshot waits for the tiles of all runs that hold it.
+        TaskKind::Tile { .. } | TaskKind::White => {
+            // The white level waits for all tiles, a snapshot for the white level and the tiles of all runs that
+            // contain it.
             "UPDATE tasks AS waits SET state = ?4
-             WHERE job = ?1 AND kind = 'assemble' AND snapshot BETWEEN ?2 AND ?2 + ?6 - 1
-               AND state = ?3
+             WHERE job = ?1 AND state = ?3
+               AND (kind = 'white' AND NOT EXISTS (SELECT 1 FROM tasks
+                                                   WHERE job = ?1 AND kind = 'tile' AND state <> ?5)
+                 OR kind = 'assemble' AND (?2 IS NULL OR snapshot BETWEEN ?2 AND ?2 + ?6 - 1)
+               AND EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'white' AND state = ?5)
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1 AND kind = 'tile'
                                    AND snapshot BETWEEN waits.snapshot - ?7 + 1 AND waits.snapshot
-                                   AND waits.snapshot < snapshot + snapshots AND state <> ?5)"
+                                   AND waits.snapshot < snapshot + snapshots AND state <> ?5))"
         }
         TaskKind::Assemble { .. } | TaskKind::Preview { .. } => {
             "UPDATE tasks SET state = ?4

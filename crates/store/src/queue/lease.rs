@@ -177,8 +177,8 @@ impl Store {
         };
         let worst: u32 = sql_as!(
             "SELECT coalesce(max(failures), 0) FROM tasks
-             WHERE job = ?1 AND kind = 'tile' AND snapshot BETWEEN ?2 - ?3 + 1 AND ?2
-               AND ?2 < snapshot + snapshots",
+             WHERE job = ?1 AND kind = 'tile'
+               AND (?2 IS NULL OR snapshot BETWEEN ?2 - ?3 + 1 AND ?2 AND ?2 < snapshot + snapshots)",
             [job, kind.snapshot(), RunSpec::LONGEST]
         )
         .fetch_one(&mut *transaction)
@@ -371,6 +371,7 @@ fn failure_text(kind: TaskKind, attempts: u32, reason: &str) -> String {
         }
         TaskKind::Assemble { snapshot } => format!("assembling snapshot {snapshot}"),
         TaskKind::Prepare => "preparing".into(),
+        TaskKind::White => "determining the white level".into(),
         TaskKind::Preview { snapshot } => format!("the preview of snapshot {snapshot}"),
         TaskKind::Pilot => "the pilot".into(),
         TaskKind::Manifest => "writing the manifest".into(),

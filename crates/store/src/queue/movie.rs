@@ -1,9 +1,10 @@
 //! Movies of results: asked for, made by a worker when nothing else is to be done, and kept with their job.
 
+use serde_json::Value;
 use sqlx::SqliteConnection;
 
 use super::graph;
-use crate::columns::{Columns, sql, sql_as};
+use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::quota;
 use crate::tables::results::WHOLE_JOB;
@@ -26,40 +27,71 @@ pub enum Movie {
 impl Store {
     /// The movie of a snapshot of a job (or, with none, of all); none if nobody has asked for it, or if it is damaged.
     pub async fn movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Option<Movie>> {
+        Ok(self.find_movie(job, snapshot).await?.map(|(movie, _)| movie))
+    }
+
+    /// The movie of a snapshot, or of all, with its display window.
+    async fn find_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Option<(Movie, Value)>> {
         let found = sql!(FIND, [job.id, place(snapshot)]).fetch_optional(&self.readers).await?;
         let Some(row) = found else { return Ok(None) };
         let (sha256, size): (Option<Sha256>, Option<u64>) =
             (row.read("result")?, row.read("size")?);
-        Ok(match (row.read("state")?, sha256.zip(size)) {
-            (TaskState::Done, Some((sha256, size))) => Some(Movie::Ready { sha256, size }),
-            (TaskState::Running, _) => Some(Movie::Asked(Some(row.read("fraction")?))),
-            (TaskState::Ready, _) => Some(Movie::Asked(None)),
+        let movie = match (row.read("state")?, sha256.zip(size)) {
+            (TaskState::Done, Some((sha256, size))) => Movie::Ready { sha256, size },
+            (TaskState::Running, _) => Movie::Asked(Some(row.read("fraction")?)),
+            (TaskState::Ready, _) => Movie::Asked(None),
             (TaskState::Failed, _) => {
                 let reason: Option<String> = row.read("reason")?;
-                Some(Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into())))
+                Movie::Failed(reason.unwrap_or_else(|| "no reason is known".into()))
             }
-            _ => None,
-        })
+            _ => return Ok(None),
+        };
+        Ok(Some((movie, row.read_json::<Value>("record")?.unwrap_or_default())))
     }
 
-    /// Asks for a movie, unless it exists or is being made. A failed one is tried again. The frames must exist.
+    /// Asks for a movie, unless it exists or is being made. A failed one is tried again, and one of another display
+    /// window is replaced. `window` is null for the job's white level. The frames must exist.
     /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if the job was deleted.
-    pub async fn create_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Movie> {
-        if let Some(found @ (Movie::Ready { .. } | Movie::Asked(_))) =
-            self.movie(job, snapshot).await?
+    pub async fn create_movie(
+        &self,
+        job: &Job,
+        snapshot: Option<u32>,
+        window: &Value,
+    ) -> Result<Movie> {
+        let place = place(snapshot);
+        if let Some((found @ (Movie::Ready { .. } | Movie::Asked(_)), shown)) =
+            self.find_movie(job, snapshot).await?
+            && shown == *window
         {
             return Ok(found);
         }
         let mut transaction = self.write().await?;
-        self.drop_movies(&mut transaction, job.id, Some(place(snapshot))).await?;
+        self.drop_movies(&mut transaction, job.id, Some(place)).await?;
         quota::check(&mut transaction, &job.lab, None, job.spec.movie_bytes(snapshot)).await?;
         let known = sql!("SELECT 1 FROM jobs WHERE id = ?", [job.id]);
         let known = known.fetch_optional(&mut *transaction).await?;
         known.ok_or_else(|| StoreError::missing("job", job.id))?;
         let (kind, cost) = (TaskKind::Movie { snapshot }, job.spec.movie_cost(snapshot));
         graph::insert_for(&mut transaction, (&job.lab, job.id.into()), kind, cost).await?;
+        sql!(
+            "UPDATE tasks SET record = ? WHERE thing = ? AND coalesce(snapshot, -1) = ?",
+            [Json(window), job.id, place]
+        )
+        .execute(&mut *transaction)
+        .await?;
         self.commit_removals(transaction).await?;
         Ok(Movie::Asked(None))
+    }
+
+    /// The values to show as black and as white in a movie; `None` for the job's white level.
+    pub(super) async fn movie_window(
+        &self,
+        job: JobId,
+        snapshot: Option<u32>,
+    ) -> Result<Option<Value>> {
+        let found = sql!(FIND, [job, place(snapshot)]).fetch_optional(&self.readers).await?;
+        let window = found.map(|row| row.read_json::<Value>("record")).transpose()?.flatten();
+        Ok(window.filter(|window| !window.is_null()))
     }
 
     /// Removes the movies of a job, or that of one snapshot of it, with the tasks that make them.
@@ -84,7 +116,7 @@ impl Store {
 }
 
 /// A damaged one is as good as none.
-const FIND: &str = "SELECT state, fraction, result, size,
+const FIND: &str = "SELECT state, fraction, result, size, record,
         (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt) AS reason
     FROM tasks
     LEFT JOIN blobs ON sha256 = result AND damaged_at IS NULL

@@ -188,6 +188,27 @@ impl Store {
         Ok(tiles)
     }
 
+    /// The record of a job's white level; `None` before it is determined.
+    pub async fn white_record(&self, job: JobId) -> Result<Option<Value>> {
+        let found: Option<Option<Json<Value>>> =
+            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job])
+                .fetch_optional(&self.readers)
+                .await?;
+        Ok(found.flatten().map(|record| record.0))
+    }
+
+    /// All tiles of a job that are done, run by run in the order of the plan, without their assessments, which are large.
+    pub async fn all_tile_results(&self, job: JobId) -> Result<Vec<TileResult>> {
+        let tiles = sql_as!(
+            "SELECT snapshot, tile, result, json_remove(record, '$.assessment') AS record FROM tasks
+             WHERE job = ? AND kind = 'tile' AND state = ? ORDER BY snapshot, tile",
+            [job, TaskState::Done]
+        )
+        .fetch_all(&self.readers)
+        .await?;
+        Ok(tiles)
+    }
+
     /// Records of all tasks of a job that are done, in order.
     pub async fn task_records(&self, job: JobId) -> Result<Vec<TaskRecord>> {
         let rows = sql!(

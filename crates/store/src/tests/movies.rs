@@ -1,5 +1,7 @@
 //! Movies: requested at any time, made in the turns of their lab, deleted with their jobs.
 
+use serde_json::Value;
+
 use super::{LEASE, Lab};
 use crate::{Claimant, Heartbeat, Job, Movie};
 use engine::job::{Algorithm, JobId, JobState, TaskKind};
@@ -23,11 +25,11 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
     let lab = Lab::new().await;
     let job = lab.done().await;
     for _ in 0..2 {
-        let asked = lab.store.create_movie(&job, Some(1)).await.unwrap();
+        let asked = lab.store.create_movie(&job, Some(1), &Value::Null).await.unwrap();
         assert_eq!(asked, Movie::Asked(None));
     }
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), None, "reading creates no movie");
-    assert_eq!(lab.store.create_movie(&job, None).await.unwrap(), Movie::Asked(None));
+    assert_eq!(lab.store.create_movie(&job, None, &Value::Null).await.unwrap(), Movie::Asked(None));
     let other = lab.submit(-100).await;
     let done = lab.work_off().await;
     let movies = [TaskKind::Movie { snapshot: Some(1) }, TaskKind::Movie { snapshot: None }];
@@ -35,7 +37,7 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
     assert!(movies.iter().all(|movie| done[..2].contains(movie)), "{done:?}");
     lab.job(other).await;
     let one = lab.store.movie(&job, Some(1)).await.unwrap();
-    let all = lab.store.create_movie(&job, None).await.unwrap();
+    let all = lab.store.create_movie(&job, None, &Value::Null).await.unwrap();
     let (Some(Movie::Ready { sha256: one, .. }), Movie::Ready { sha256: all, size: 10 }) =
         (one, all)
     else {
@@ -50,7 +52,7 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
 async fn a_movie_that_fails_fails_nothing_else() {
     let lab = Lab::new().await;
     let job = lab.done().await;
-    lab.store.create_movie(&job, None).await.unwrap();
+    lab.store.create_movie(&job, None, &Value::Null).await.unwrap();
     let task = lab.claim().await.unwrap();
     assert_eq!(task.kind, TaskKind::Movie { snapshot: None });
     assert_eq!(lab.store.movie(&job, None).await.unwrap(), Some(Movie::Asked(Some(0.0))));
@@ -60,7 +62,7 @@ async fn a_movie_that_fails_fails_nothing_else() {
     for _ in 0..2 {
         assert_eq!(lab.store.movie(&job, None).await.unwrap(), failed);
     }
-    assert_eq!(lab.store.create_movie(&job, None).await.unwrap(), Movie::Asked(None));
+    assert_eq!(lab.store.create_movie(&job, None, &Value::Null).await.unwrap(), Movie::Asked(None));
 
     // A job may go while a worker is at its movie: here the one that leaves tiles to other machines.
     let claimant = Claimant::WithoutTiles;

@@ -45,9 +45,10 @@ async fn a_snapshot_waits_for_all_runs_that_hold_it() {
     let order = [
         tile(0, 0),
         tile(0, 1),
-        assemble(0),
         tile(1, 0),
         tile(1, 1),
+        TaskKind::White,
+        assemble(0),
         assemble(1),
         assemble(2),
         TaskKind::Manifest,
@@ -60,8 +61,8 @@ async fn a_snapshot_waits_for_all_runs_that_hold_it() {
 async fn tiles_belong_to_all_snapshots_of_their_run() {
     let lab = Lab::new().await;
     let job = lab.submit_sequence().await;
-    // Prepare, three previews, the pilot, the first run and its snapshot, the second run.
-    lab.work_on(5 + 3 + 2).await;
+    // Prepare, three previews, the pilot, both runs, the white level and the first snapshot.
+    lab.work_on(5 + 4 + 2).await;
     let assembly = lab.claim().await.unwrap();
     assert_eq!(assembly.kind, assemble(1));
     let places = |tiles: &[crate::TileResult]| -> Vec<_> {
@@ -90,6 +91,6 @@ async fn a_sequence_that_is_taken_up_again_keeps_what_is_done() {
     lab.store.cancel_job(&local, job).await.unwrap();
     lab.store.retry_job(&local, job).await.unwrap();
     let done = lab.work_off().await;
-    assert_eq!(done[..2], [assemble(0), tile(1, 0)]);
+    assert_eq!(done[..4], [tile(1, 0), tile(1, 1), TaskKind::White, assemble(0)]);
     assert_eq!(lab.state(job).await, JobState::Succeeded);
 }

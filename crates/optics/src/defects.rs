@@ -1,0 +1,297 @@
+//! Pixels of a snapshot that carry no information on the scene: saturated ones, and outliers.
+
+use ndarray::{Array2, ArrayView2};
+
+use super::{Finding, FindingCode};
+
+/// Smallest number of pixels at the largest value that counts as a pile-up.
+const MIN_PILE_UP: usize = 8;
+/// A pile-up has this many times the pixels of the other values near the largest one. Simulated snapshots of 2 to 16
+/// frames have at most 0.6 times, clipped ones at least 10 times.
+const PILE_UP_RATIO: f64 = 4.0;
+/// Values above this share of the largest one are compared with it.
+const NEAR_LARGEST: f32 = 0.9;
+/// A white scene reaches the largest value where all masks are open. This share of the pixels may differ.
+const MAX_DIFFERENT: f64 = 0.05;
+
+/// Value from which on the pixels of a snapshot are saturated, if they are: `stated`, or the largest value if pixels pile
+/// up at it. `values` \[H,W\] are as stored, NaN where nothing was measured; `light` \[H,W\] is the sum of the masks.
+///
+/// A sensor clips what is brighter than its largest value, whatever the type of the file and its full scale.
+pub fn saturation(
+    values: ArrayView2<'_, f32>,
+    light: ArrayView2<'_, f32>,
+    stated: Option<f32>,
+) -> Option<f32> {
+    if stated.is_some() {
+        return stated;
+    }
+    let finite = values.iter().zip(&light).filter(|(value, _)| value.is_finite());
+    let largest = finite.clone().map(|(value, _)| *value).fold(f32::NEG_INFINITY, f32::max);
+    let (brightest, smallest) =
+        finite.clone().fold((0f32, f32::INFINITY), |(light, least), (value, l)| {
+            (light.max(*l), least.min(*value))
+        });
+    if largest <= 0.0 || smallest == largest {
+        return None;
+    }
+    let (mut piled_up, mut different, mut near) = (0usize, 0usize, Vec::new());
+    for (&value, &light) in finite {
+        if value == largest {
+            piled_up += 1;
+            different += usize::from(light < 0.999 * brightest);
+        } else if value > NEAR_LARGEST * largest {
+            near.push(value);
+        }
+    }
+    near.sort_unstable_by(f32::total_cmp);
+    let values = near.chunk_by(|one, next| one == next).count().max(1);
+    #[allow(clippy::cast_precision_loss)] // counts of pixels
+    let is_pile_up = piled_up >= MIN_PILE_UP
+        && piled_up as f64 >= PILE_UP_RATIO * near.len() as f64 / values as f64
+        && different as f64 > MAX_DIFFERENT * piled_up as f64;
+    is_pile_up.then_some(largest)
+}
+
+/// Distance of the farthest neighbours of a pixel along each axis.
+const REACH: usize = 2;
+/// Number of neighbours that may be outliers themselves.
+const FEW: usize = 2;
+/// A pixel is too bright at this many times the brightest neighbours.
+const TOO_BRIGHT: f32 = 2.0;
+/// A pixel is too dark at this share of the darkest neighbours.
+const TOO_DARK: f32 = 0.05;
+/// Smallest deviations of outliers, as shares of the 99th percentile of the snapshot.
+const MIN_EXCESS: f32 = 0.1;
+const MIN_DEFICIT: f32 = 0.25;
+/// Masks must pass this share of the mean light to compare the brightness of neighbours, and to call a pixel dark.
+const ENOUGH_LIGHT: f32 = 0.25;
+const MUCH_LIGHT: f32 = 0.75;
+
+/// Pixels (row, column) that are far brighter or darker than their neighbours and than their masks allow: hot and dead
+/// ones. `y` \[H,W\] is a snapshot without dark, NaN where nothing was measured; `light` \[H,W\] is the sum of the masks.
+/// Neighbours are `step` pixels apart: 2 behind a mosaic, where they have one colour.
+///
+/// The brightness of the scene at a pixel is at least `y / light`. A hot pixel exceeds both the values and `light` times the
+/// brightness of nearly all of its 24 neighbours twice. A dead one has a twentieth of that brightness.
+pub fn outliers(
+    y: ArrayView2<'_, f32>,
+    light: ArrayView2<'_, f32>,
+    step: usize,
+) -> Vec<(usize, usize)> {
+    let (height, width) = y.dim();
+    let mut sorted: Vec<f32> = y.iter().copied().filter(|value| value.is_finite()).collect();
+    if sorted.is_empty() {
+        return Vec::new();
+    }
+    let index = (sorted.len() - 1) * 99 / 100;
+    let (_, &mut bright, _) = sorted.select_nth_unstable_by(index, f32::total_cmp);
+    let mean_light = light.iter().filter(|light| light.is_finite()).sum::<f32>() / y.len() as f32;
+    if bright <= 0.0 || mean_light <= 0.0 {
+        return Vec::new();
+    }
+    let (excess, deficit) = (MIN_EXCESS * bright, MIN_DEFICIT * bright);
+    let neighbours = |at: usize, length: usize| {
+        let first = at - step * (at / step).min(REACH);
+        (first..length.min(at + step * REACH + 1)).step_by(step)
+    };
+    let is_outlier = |&((row, column), &value): &((usize, usize), &f32)| {
+        let own = light[[row, column]];
+        // Most pixels need no look at their neighbours.
+        let may_be_dark =
+            own > MUCH_LIGHT * mean_light && value < TOO_DARK * own / mean_light * bright;
+        if !value.is_finite() || !(value > excess || may_be_dark) {
+            return false;
+        }
+        let (mut values, mut ratios) = ([f32::NEG_INFINITY; FEW + 1], [f32::NEG_INFINITY; FEW + 1]);
+        let mut darkest = [f32::INFINITY; FEW];
+        for row_near in neighbours(row, height) {
+            for column_near in neighbours(column, width) {
+                let (near, light) = (y[[row_near, column_near]], light[[row_near, column_near]]);
+                if (row_near, column_near) == (row, column) || !near.is_finite() {
+                    continue;
+                }
+                insert(&mut values, near, |new, old| new > old);
+                if light > ENOUGH_LIGHT * mean_light {
+                    insert(&mut ratios, near / light, |new, old| new > old);
+                    insert(&mut darkest, near / light, |new, old| new < old);
+                }
+            }
+        }
+        let (brightest, ratio, darkest) = (values[FEW], ratios[FEW], darkest[FEW - 1]);
+        if !(brightest.is_finite() && ratio.is_finite() && darkest.is_finite()) {
+            return false;
+        }
+        let is_hot = value > TOO_BRIGHT * brightest.max(0.0) + excess
+            && value > TOO_BRIGHT * own * ratio.max(0.0) + excess;
+        let expected = own * darkest;
+        let is_dead =
+            own > MUCH_LIGHT * mean_light && expected > deficit && value < TOO_DARK * expected;
+        is_hot || is_dead
+    };
+    y.indexed_iter().filter(is_outlier).map(|(place, _)| place).collect()
+}
+
+/// Inserts a value into a list in order and drops the last one.
+fn insert(list: &mut [f32], value: f32, before: impl Fn(f32, f32) -> bool) {
+    let Some(place) = list.iter().position(|old| before(value, *old)) else { return };
+    list[place..].rotate_right(1);
+    list[place] = value;
+}
+
+/// A snapshot in which saturated pixels and outliers are NaN, and their numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Defects {
+    /// Number of pixels that were NaN, or bad by the calibration.
+    pub missing: usize,
+    /// Number of outliers.
+    pub outliers: usize,
+    /// Number of saturated pixels.
+    pub saturated: usize,
+    /// Value from which on pixels are saturated.
+    pub level: Option<f32>,
+}
+
+impl Defects {
+    /// Marks the defects of a snapshot \[H,W\], as stored, with NaN. `dark` is subtracted where outliers are looked for.
+    /// Where `light` \[H,W\], the sum of the masks, is NaN, the calibration has no masks.
+    pub fn mark(
+        values: &mut Array2<f32>,
+        dark: Option<&Array2<f32>>,
+        light: ArrayView2<'_, f32>,
+        (step, stated): (usize, Option<f32>),
+    ) -> Self {
+        let mut found = Self::default();
+        ndarray::azip!((value in &mut *values, &light in &light) {
+            if light.is_nan() {
+                *value = f32::NAN;
+            }
+        });
+        found.missing = values.iter().filter(|value| value.is_nan()).count();
+        let y = dark.map_or_else(|| values.clone(), |dark| &*values - dark);
+        for place in outliers(y.view(), light, step) {
+            values[place] = f32::NAN;
+            found.outliers += 1;
+        }
+        found.level = saturation(values.view(), light, stated);
+        if let Some(level) = found.level {
+            found.saturated = values.iter().filter(|value| **value >= level).count();
+            // Without nearly all pixels there is nothing to reconstruct from.
+            if found.saturated * 10 <= values.len() * 9 {
+                values.mapv_inplace(|value| if value >= level { f32::NAN } else { value });
+            }
+        }
+        found
+    }
+}
+
+/// Share of saturated pixels from which there is a finding, and from which frames are wrong.
+const REPORTED_SHARE: f64 = 0.001;
+const GRAVE_SHARE: f64 = 0.2;
+
+/// Reports the defects of a snapshot of `pixels` pixels.
+#[allow(clippy::cast_precision_loss)] // counts of pixels
+pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
+    const LEFT_OUT: &str = "They are left out of the reconstruction";
+    let share = |count: usize| count as f64 / pixels.max(1) as f64;
+    let mut findings = Vec::new();
+    let Defects { missing, outliers, saturated, level } = *defects;
+    if let (Some(level), true) = (level, share(saturated) > REPORTED_SHARE) {
+        let detail = format!(
+            "{:.2} % of the pixels are at {level} or above, the limit of the sensor: they were saturated. {LEFT_OUT}",
+            100.0 * share(saturated)
+        );
+        let finding = Finding::new(FindingCode::Saturated, detail);
+        findings.push(finding.escalate_if(share(saturated) > GRAVE_SHARE));
+    }
+    if missing + outliers > 0 {
+        let mut parts = Vec::new();
+        if outliers > 0 {
+            parts.push(format!(
+                "{outliers} pixels are far brighter or darker than their neighbours and their masks allow"
+            ));
+        }
+        if missing > 0 {
+            parts.push(format!("{missing} pixels are marked as not measured"));
+        }
+        let detail = format!("{}. {LEFT_OUT}", parts.join(", and "));
+        let grave = share(missing + outliers) > GRAVE_SHARE;
+        findings.push(Finding::new(FindingCode::BadPixels, detail).escalate_if(grave));
+    }
+    findings
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Defects, outliers, saturation};
+    use crate::{iid_masks, measure, noisy, random_squares};
+    use ndarray::{Array2, Array3, Axis};
+
+    /// A bright disc that moves over dark texture.
+    fn scene(frames: usize) -> Array3<f32> {
+        Array3::from_shape_fn((frames, 96, 96), |(k, i, j)| {
+            let at = (i as f32 - 40.0).hypot(j as f32 - 30.0 - 3.0 * k as f32);
+            if at < 9.0 { 0.9 } else { 0.1 + 0.1 * (i as f32 * 0.7).sin() * (j as f32 * 0.4).cos() }
+        })
+    }
+
+    fn all_masks(frames: usize) -> [Array3<f32>; 2] {
+        [iid_masks(frames, 96, 96, 3).unwrap(), random_squares(frames, 96, 96, 3).unwrap().0]
+    }
+
+    #[test]
+    fn hot_and_dead_pixels_are_found_and_scenes_have_none() {
+        for (frames, masks) in [4, 8, 16].into_iter().flat_map(|b| all_masks(b).map(|m| (b, m))) {
+            let light = masks.sum_axis(Axis(0));
+            let clean = measure(masks.view(), scene(frames).view()).unwrap();
+            for noise in [0.0, 0.02] {
+                let y = noisy(clean.clone(), noise, 1).unwrap();
+                assert_eq!(outliers(y.view(), light.view(), 1), [], "{frames} {noise}");
+            }
+            let mut y = clean.clone();
+            let places = [(3, 3), (40, 50), (41, 50), (90, 95)];
+            places.iter().for_each(|place| y[*place] = 8.0);
+            let found = outliers(y.view(), light.view(), 1);
+            assert_eq!(found, places, "{frames}");
+        }
+    }
+
+    #[test]
+    fn a_pile_up_is_saturation_in_any_unit() {
+        for (frames, masks) in [4, 8, 16].into_iter().flat_map(|b| all_masks(b).map(|m| (b, m))) {
+            let light = masks.sum_axis(Axis(0));
+            let y = measure(masks.view(), scene(frames).view()).unwrap();
+            let brightest = y.iter().copied().fold(0.0, f32::max);
+            for unit in [1.0, 4095.0] {
+                let stored = |y: &Array2<f32>| match unit {
+                    1.0 => y.clone(),
+                    _ => (y / brightest * unit).mapv(f32::round),
+                };
+                assert_eq!(saturation(stored(&y).view(), light.view(), None), None, "{frames}");
+                for clip in [0.5, 0.8] {
+                    let level = clip * brightest;
+                    let mut clipped = stored(&y.mapv(|y| y.min(level)));
+                    let expected = clipped.iter().copied().fold(0.0, f32::max);
+                    let count = clipped.iter().filter(|value| **value == expected).count();
+                    let found = Defects::mark(&mut clipped, None, light.view(), (1, None));
+                    assert_eq!(
+                        (found.level, found.saturated),
+                        (Some(expected), count),
+                        "{found:?}"
+                    );
+                    assert_eq!(clipped.iter().filter(|value| value.is_nan()).count(), count);
+                }
+            }
+        }
+    }
+
+    /// A white scene reaches the same largest value at all pixels behind open masks.
+    #[test]
+    fn a_white_scene_is_not_saturated() {
+        let masks = iid_masks(4, 96, 96, 3).unwrap();
+        let y = measure(masks.view(), Array3::ones((4, 96, 96)).view()).unwrap();
+        let light = masks.sum_axis(Axis(0));
+        assert_eq!(saturation(y.view(), light.view(), None), None);
+        assert_eq!(saturation(y.view(), light.view(), Some(3.0)), Some(3.0));
+    }
+}
