@@ -60,8 +60,8 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
         (spread["height"].as_u64(), spread["width"].as_u64()),
         (Some(height as u64), Some(width as u64))
     );
-    let picture = format!("{base}/pictures/error-2/tiles/0/0/0?black=0&white=0.5")
-        .replace("/v1/", "/view/");
+    let picture =
+        format!("{base}/pictures/error-2/tiles/0/0/0?black=0&white=0.5").replace("/v1/", "/view/");
     let (_, columns, shown) = decode(&app.get(&picture).await.expect(200));
     let second = &values[blocks.0 * blocks.1..];
     for (row, column) in [(0, 0), (17, 3), (height - 1, width - 1)] {
