@@ -113,10 +113,11 @@ impl Wait {
             match (name.trim().to_ascii_lowercase().as_str(), found) {
                 ("respond-async", Self::Unstated) => found = Self::Async,
                 // Malformed preferences are ignored, as the RFC requires.
-                ("wait", _) => match seconds().filter(|seconds| *seconds >= 0.0) {
-                    Some(seconds) => found = Self::Seconds(seconds.min(LONGEST_WAIT)),
-                    None => {}
-                },
+                ("wait", _) => {
+                    if let Some(seconds) = seconds().filter(|seconds| *seconds >= 0.0) {
+                        found = Self::Seconds(seconds.min(LONGEST_WAIT));
+                    }
+                }
                 _ => {}
             }
         }

@@ -110,7 +110,6 @@ pub(super) fn exposed() -> Vec<HeaderName> {
         "tus-checksum-algorithm",
         "upload-offset",
         "upload-length",
-        "upload-defer-length",
         "upload-metadata",
         "upload-expires",
     ];

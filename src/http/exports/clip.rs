@@ -87,7 +87,7 @@ pub(super) async fn zarr(
     let (frames, ..) = clip.shape();
     let end = if clip.channels() == Channels::Rgb { "/0/0/0" } else { "/0/0" };
     let number = path.strip_prefix("c/").and_then(|rest| rest.strip_suffix(end));
-    let frame = number.and_then(|text| plain(text)).filter(|frame| *frame < frames);
+    let frame = number.and_then(plain).filter(|frame| *frame < frames);
     let frame = frame.ok_or_else(|| {
         let detail =
             format!("the array has zarr.json and the chunks c/0{end} to c/{}{end}", frames - 1);

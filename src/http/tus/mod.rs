@@ -135,6 +135,11 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
         let detail = "uploads are not concatenated: send the file as one upload (parallelUploads: 1 in tus-js-client)";
         return Err(malformed(detail.into()));
     }
+    if headers.contains_key("upload-defer-length") {
+        let detail = "an upload states its length when it is created: send Upload-Length in place of \
+                      Upload-Defer-Length";
+        return Err(malformed(detail.into()));
+    }
     let length = number(&headers, &LENGTH)?;
     if length == 0 {
         return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
