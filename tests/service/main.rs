@@ -49,3 +49,4 @@ mod uploads;
 mod watching;
 mod white_level;
 mod work;
+mod wrong_inputs;
