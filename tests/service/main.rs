@@ -50,3 +50,4 @@ mod uploads;
 mod watching;
 mod white_level;
 mod work;
+mod wrong_inputs;

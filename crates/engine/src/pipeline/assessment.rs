@@ -219,7 +219,7 @@ fn is_in_doubt(findings: &[Finding]) -> bool {
         UnexplainedPixels,
         WrongDark,
     ];
-    // Where many pixels were not measured, the model does not know how many.
+    // The quality model does not count pixels that were not measured.
     let lacks_pixels = |finding: &Finding| {
         finding.severity == Severity::Error
             && (finding.is(FindingCode::Saturated) || finding.is(FindingCode::BadPixels))
