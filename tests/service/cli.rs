@@ -79,12 +79,8 @@ fn a_simulated_snapshot_is_reconstructed() {
         let out = files.text("result");
         let output = files.reconstruct(pattern, &["--out", &out]);
         let report: Value = serde_json::from_slice(&output.stdout).unwrap();
-        // Of four independent binary masks, one pixel in 16 is closed in all.
-        let codes: Vec<&Value> =
-            report["findings"].as_array().unwrap().iter().map(|found| &found["code"]).collect();
-        let is_bad = codes.contains(&&Value::from("bad_calibration"));
-        assert_eq!(is_bad, pattern == "iid", "{report:#}");
-        assert_eq!(output.status.code(), Some(if is_bad { 3 } else { 0 }));
+        // Of four independent binary masks, one pixel in 16 is closed in all by chance, which is no fault.
+        assert_eq!(output.status.code(), Some(0), "{report:#}");
         let fields: Vec<&str> = report.as_object().unwrap().keys().map(String::as_str).collect();
         let mut expected = vec![
             "algorithm",
