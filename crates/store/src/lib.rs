@@ -17,6 +17,7 @@ mod backup;
 mod cleaning;
 mod clock;
 mod columns;
+mod deletion;
 mod dir;
 mod error;
 mod hashes;

@@ -8,13 +8,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::Store;
-use crate::columns::{Columns, sql, sql_as};
-use crate::error::Result;
-use engine::job::{JobId, JobState, Lab};
-
-/// Workers that were silent for longer do not count.
-const WORKER_AGE: Duration = Duration::from_secs(15);
+use engine::job::{JobId, Lab};
 
 /// A forecast is good for so long for each job in it, about twenty times as long as it takes to make: it
 /// costs a twentieth of a core, however many ask.
@@ -31,98 +25,18 @@ const OUTDATED: Duration = Duration::from_secs(30);
 pub struct Forecasts {
     last: Mutex<Option<Arc<Forecast>>>,
     /// Held while a forecast is made.
-    making: Arc<tokio::sync::Mutex<()>>,
+    pub(super) making: Arc<tokio::sync::Mutex<()>>,
 }
 
 impl Forecasts {
-    fn last(&self) -> Option<Arc<Forecast>> {
+    pub(super) fn last(&self) -> Option<Arc<Forecast>> {
         self.last.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    async fn renew(&self, store: &Store) -> Result<Arc<Forecast>> {
-        let made = Arc::new(store.new_forecast().await?);
+    pub(super) fn keep(&self, made: Forecast) -> Arc<Forecast> {
+        let made = Arc::new(made);
         *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Some(made.clone());
-        Ok(made)
-    }
-}
-
-impl Store {
-    /// The load ahead of every unfinished job. While the forecast of a long queue is renewed, callers get the last one,
-    /// so that no request takes longer in a longer queue.
-    pub(super) async fn forecast(&self) -> Result<Arc<Forecast>> {
-        match self.forecasts.last() {
-            Some(last) if last.is_good() => return Ok(last),
-            Some(last) if last.jobs.len() > LONG && !last.is_outdated() => {
-                if let Ok(making) = self.forecasts.making.clone().try_lock_owned() {
-                    let store = self.clone();
-                    tokio::spawn(async move {
-                        let _making = making;
-                        if let Err(error) = store.forecasts.renew(&store).await {
-                            tracing::warn!(%error, "the forecast of the queue can't be renewed");
-                        }
-                    });
-                }
-                return Ok(last);
-            }
-            _ => {}
-        }
-        let _making = self.forecasts.making.lock().await;
-        match self.forecasts.last() {
-            Some(last) if last.is_good() => Ok(last),
-            _ => self.forecasts.renew(self).await,
-        }
-    }
-
-    async fn new_forecast(&self) -> Result<Forecast> {
-        let rows = sql!(
-            "SELECT id, lab, priority, state, tiles_left + others_left AS left
-             FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
-             WHERE finished_at IS NULL ORDER BY id",
-        )
-        .fetch_all(&self.readers)
-        .await?;
-        let found: Vec<(Lab, f64)> =
-            sql_as!("SELECT lab, share FROM labs").fetch_all(&self.readers).await?;
-        let shares: HashMap<Lab, f64> = found.into_iter().collect();
-        let mut labs: Vec<(Lab, f64)> = Vec::new();
-        let (mut places, mut unfinished) = (HashMap::new(), Vec::with_capacity(rows.len()));
-        for row in &rows {
-            let lab: Lab = row.read("lab")?;
-            let place = *places.entry(lab).or_insert_with_key(|lab| {
-                labs.push((lab.clone(), shares.get(lab).copied().unwrap_or(1.0)));
-                labs.len() - 1
-            });
-            unfinished.push(Unfinished {
-                id: row.read("id")?,
-                lab: place,
-                priority: row.read("priority")?,
-                waits: row.read::<JobState>("state")? == JobState::Queued,
-                left: row.read("left")?,
-            });
-        }
-        let workers = self.live_tile_workers(WORKER_AGE).await?;
-        Ok(Forecast::new(&unfinished, labs, workers, self.rates().await?))
-    }
-
-    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: the mean
-    /// over the last tasks of a kind, weighted by their real cost; 1 before there are any.
-    async fn rates(&self) -> Result<(f64, f64)> {
-        let row = sql!(
-            "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
-                    / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
-                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
-                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
-             FROM totals",
-        )
-        .fetch_one(&self.readers)
-        .await?;
-        let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
-        Ok((rate(row.read("tiles")?), rate(row.read("others")?)))
-    }
-
-    /// Planned CPU-seconds left of the unfinished jobs of each lab that has any.
-    pub async fn cost_left_by_lab(&self) -> Result<HashMap<Lab, f64>> {
-        Ok(self.forecast().await?.left_by_lab.clone())
+        made
     }
 }
 
@@ -137,7 +51,7 @@ pub struct Forecast {
     jobs: HashMap<JobId, Ahead>,
     /// The load ahead of a new job.
     new_job: Ahead,
-    left_by_lab: HashMap<Lab, f64>,
+    pub(super) left_by_lab: HashMap<Lab, f64>,
     until: Instant,
 }
 
@@ -161,13 +75,13 @@ struct Ahead {
 
 /// A job that has not ended.
 #[derive(Debug)]
-struct Unfinished {
-    id: JobId,
-    lab: usize,
-    priority: i64,
-    waits: bool,
+pub(super) struct Unfinished {
+    pub(super) id: JobId,
+    pub(super) lab: usize,
+    pub(super) priority: i64,
+    pub(super) waits: bool,
     /// Planned CPU-seconds that are left of it.
-    left: f64,
+    pub(super) left: f64,
 }
 
 impl Forecast {
@@ -196,7 +110,7 @@ impl Forecast {
 
     /// For as many workers, which take these seconds for a planned CPU-second of tiles and of other tasks. `labs` has
     /// the name and the share of each lab.
-    fn new(
+    pub(super) fn new(
         unfinished: &[Unfinished],
         labs: Vec<(Lab, f64)>,
         workers: usize,
@@ -223,11 +137,16 @@ impl Forecast {
     }
 
     /// False once it should be renewed.
-    fn is_good(&self) -> bool {
+    pub(super) fn is_good(&self) -> bool {
         Instant::now() < self.until
     }
 
-    fn is_outdated(&self) -> bool {
+    /// True if it takes so long to make that callers should not wait for a new one.
+    pub(super) fn is_long(&self) -> bool {
+        self.jobs.len() > LONG
+    }
+
+    pub(super) fn is_outdated(&self) -> bool {
         Instant::now() > self.until + OUTDATED
     }
 

@@ -7,7 +7,7 @@ use crate::columns::{Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::jobs::{self, JobChanges};
 use crate::tables::sums;
-use crate::{Store, records, removal};
+use crate::{Store, deletion, records};
 use engine::job::{Assessment, IllegalTransition, JobId, JobState, Lab, TaskState};
 
 impl Store {
@@ -97,7 +97,7 @@ impl Store {
         self.drop_tiles(&mut transaction, id).await?;
         self.drop_movies(&mut transaction, id, None).await?;
         sql!("DELETE FROM jobs WHERE id = ?", [id]).execute(&mut *transaction).await?;
-        removal::note_results(&mut transaction, id).await?;
+        deletion::note_results(&mut transaction, id).await?;
         self.commit_removals(transaction).await
     }
 

@@ -8,6 +8,7 @@
 mod claim;
 mod complete;
 mod forecast;
+mod forecasting;
 pub(super) mod graph;
 mod job;
 mod lease;

@@ -9,7 +9,7 @@ use crate::error::{Result, StoreError};
 use crate::rows::Page;
 use crate::staging::StagedBlob;
 use crate::tables::quota;
-use crate::{Store, on_files, removal};
+use crate::{Store, deletion, on_files};
 use engine::job::{Lab, Sha256, Timestamp, TokenId};
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
@@ -200,7 +200,7 @@ impl Store {
         .fetch_optional(&mut *transaction)
         .await?;
         match removed {
-            Some(created_at) => removal::note_blob(transaction, sha256, created_at).await,
+            Some(created_at) => deletion::note_blob(transaction, sha256, created_at).await,
             None => Ok(()),
         }
     }
@@ -231,7 +231,7 @@ impl Store {
         );
         let removed: Vec<(Sha256, Timestamp)> = removed.fetch_all(&mut *transaction).await?;
         for (sha256, created_at) in &removed {
-            removal::note_blob(&mut transaction, *sha256, *created_at).await?;
+            deletion::note_blob(&mut transaction, *sha256, *created_at).await?;
         }
         self.commit_removals(transaction).await?;
         Ok(removed.len())
