@@ -4,9 +4,9 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use axum::http::{HeaderValue, Uri};
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
+use hyper::http::{HeaderValue, Uri};
 use strum::IntoStaticStr;
 
 #[cfg(feature = "nats")]

@@ -8,9 +8,8 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, Uri, header};
 use axum::response::Response;
 use serde::Serialize;
-use tokio::sync::MutexGuard;
+use tokio::sync::{Mutex, MutexGuard};
 
-use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Result};
 
@@ -66,14 +65,14 @@ impl RequestContext {
         format!("<?{}>; rel=\"next\"", query.join("&"))
     }
 
-    /// Checks `If-Match` of a request that changes or deletes something; `current` gives its representation. No
-    /// other request changes anything until the guard is dropped.
+    /// Checks `If-Match` of a request that changes or deletes something; `current` gives its representation. `changes` is
+    /// the lock of all such requests: no other one changes anything until the guard is dropped.
     pub(super) async fn precondition<'a, T: Serialize>(
         &self,
-        app: &'a App,
+        changes: &'a Mutex<()>,
         current: impl Future<Output = Result<T>>,
     ) -> Result<MutexGuard<'a, ()>> {
-        let guard = app.changes.lock().await;
+        let guard = changes.lock().await;
         if self.headers.contains_key(header::IF_MATCH) {
             conditional::check_match(&self.headers, &conditional::etag_of(&current.await?)?)?;
         }

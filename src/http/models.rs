@@ -65,7 +65,7 @@ pub(super) async fn rename(
     request: RequestContext,
     Body(renaming): Body<Renaming>,
 ) -> Result<Response> {
-    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
+    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
     app.store.rename_model(&access.lab, id, renaming.name.as_ref()).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
@@ -75,7 +75,7 @@ pub(super) async fn delete(
     Params(id): Params<ModelId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard = request.precondition(&app, body(&app, &access.lab, id)).await?;
+    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
     app.store.delete_model(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -5,6 +5,7 @@ mod archive;
 mod clip;
 mod composed;
 mod exr;
+mod format;
 mod lines;
 pub(super) mod movie;
 
@@ -16,33 +17,8 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Params, QueryOf};
 use super::results::{frame_file, send};
 use clip::Clip;
+use format::Format;
 pub(super) use movie::create;
-
-/// The formats, as paths name them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum Format {
-    /// All frames of a snapshot as one multi-part EXR.
-    Exr,
-    /// All frames as one array.
-    Npy,
-    /// A BigTIFF with a page per frame.
-    Tiff,
-    /// A Zarr array, which is a tree of files.
-    Zarr,
-    /// A movie.
-    Mp4,
-    /// Each frame of a snapshot as EXR and PNG, which is a tree of files.
-    Frames,
-    /// Frames of a colour sensor before demosaicking.
-    Mosaic,
-    /// The expected error of blocks of the frames.
-    Error,
-    /// Inputs, parameters and outcome.
-    Manifest,
-    /// All files of a job.
-    Zip,
-}
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -216,7 +216,7 @@ pub(super) async fn patch(
     request: RequestContext,
     body: Body,
 ) -> Result<Response> {
-    drop(request.precondition(&app, current(&app, &access.lab, id)).await?);
+    drop(request.precondition(&app.changes, current(&app, &access.lab, id)).await?);
     let permit = app.admission.place(&access.lab)?;
     let upload = to_the_end(async move {
         let _permit = permit;
@@ -294,7 +294,7 @@ pub(super) async fn delete(
     Params(id): Params<PartialId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard = request.precondition(&app, current(&app, &access.lab, id)).await?;
+    let _guard = request.precondition(&app.changes, current(&app, &access.lab, id)).await?;
     app.store.partial(&access.lab, id).await?;
     let store = app.store.clone();
     let deleted = to_the_end(async move { Ok(store.delete_partial(id).await?) });
