@@ -47,7 +47,7 @@ def jupyter(result):
     picture = Image.open(io.BytesIO(b64decode(re.search(r"base64,([^\"]+)", text)[1])))
     frames = result.snapshot(result.snapshots[0])
     height, width = frames.shape[1:3]
-    assert picture.n_frames == len(frames) and 128 < max(picture.size) <= 384, picture
+    assert picture.n_frames == len(frames) and 64 <= max(picture.size) <= 384, picture
     assert abs(picture.width / picture.height - width / height) < 0.02, picture
 
 

@@ -151,8 +151,9 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     // The truth may be in colour or in the mosaic of the sensor.
     let truth = app.upload(lab.file("truth.npy")).await;
     let quality = app.get(&format!("{base}/quality?truth={truth}")).await.expect(200).json();
+    // The peak is the white level of the job.
     let psnr = quality["psnr"].as_f64().unwrap();
-    assert!(psnr > 25.0 && quality["ssim"].as_f64().unwrap() > 0.8, "{quality}");
+    assert!(psnr > 23.5 && quality["ssim"].as_f64().unwrap() > 0.8, "{quality}");
     let colours = values(&lab.file("truth.npy"));
     let green = [[1, 0], [2, 1]];
     let at = |at: usize| 3 * at + green[at / SIDE % 2][at % 2];
@@ -265,7 +266,7 @@ async fn workers_and_the_command_line_give_the_same_colours() {
     ];
     let report = lab.run(&[&line[..], &["--out", "out", "--json"]].concat());
     let report: Value = serde_json::from_str(&report).unwrap();
-    assert!(report["psnr_db"].as_f64().unwrap() > 25.0, "{report}");
+    assert!(report["psnr_unit_db"].as_f64().unwrap() > 25.0, "{report}");
     for (name, sha256) in &expected {
         let file = lab.path("out").join(format!("snapshot_000{name}"));
         assert_eq!(crate::faults::sha256(&std::fs::read(file).unwrap()), *sha256, "{name}");

@@ -137,6 +137,10 @@ async fn readiness_is_tested_by_writing() {
     let original = std::fs::read(&path).unwrap();
     let mut is_found = false;
     for page in (original.len() / 8192..original.len() / 4096).rev().step_by(3) {
+        // Only pages of trees have a structure that a check reads; the first byte is their kind.
+        if ![2, 5, 10, 13].contains(&original[page * 4096]) {
+            continue;
+        }
         let mut bytes = original.clone();
         bytes[page * 4096..page * 4096 + 64].fill(0xa5);
         std::fs::write(&path, bytes).unwrap();

@@ -147,7 +147,7 @@ async fn the_service_leaves_out_what_was_not_measured() {
     let job = app.submit(&job).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
     for snapshot in 0..3 {
-        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/frames.npy");
+        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/npy");
         let frames = values(&app.get(&path).await.expect(200).bytes);
         let truth = |index: usize| match snapshot {
             1 => 0.0,

@@ -158,7 +158,7 @@ async fn downloads(app: &TestApp, job: &str, expected: &BTreeMap<String, String>
     for snapshot in 0..Scene::SMALL.snapshots {
         let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/npy");
         let bytes = app.get(&path).await.expect(200).bytes;
-        if sha256(&bytes) != expected[&format!("{snapshot}/exports/npy")] {
+        if sha256(&bytes) != expected[&format!("{snapshot}/frames.npy")] {
             return false;
         }
     }

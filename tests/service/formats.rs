@@ -212,7 +212,7 @@ async fn integer_masks_of_zeros_and_ones_are_closed_and_open() {
         assert_eq!(made["full_scale"], 1.0, "{code}");
         assert!((made["mask_mean"].as_f64().unwrap() - 0.5).abs() < 0.02, "{made:#}");
         // One pixel in 256 is dark in all masks, and one is open in all, by chance.
-        let report = format!("/v1/calibrations/{}/report.json", made["id"].as_str().unwrap());
+        let report = format!("/v1/calibrations/{}/report", made["id"].as_str().unwrap());
         let report = app.get_until(&report, 200).await.json();
         let codes: Vec<&str> = report["findings"]
             .as_array()
@@ -296,8 +296,9 @@ async fn windows_and_ranges_select_the_part_that_masks_and_snapshots_share() {
     let cropped = measure(json!({"data": large, "crop": crop})).await.expect(201).json();
     assert_eq!((&cropped["height"], &cropped["width"]), (&json!(rows), &json!(columns)));
     assert_eq!(cropped["reading"]["crop"], crop);
-    let picture =
-        |of: &Value| format!("/v1/measurements/{}/pictures/snapshot-0", of["id"].as_str().unwrap());
+    let picture = |of: &Value| {
+        format!("/view/measurements/{}/pictures/snapshot-0", of["id"].as_str().unwrap())
+    };
     let (first, second) = (app.get(&picture(&plain)).await, app.get(&picture(&cropped)).await);
     assert_eq!(first.bytes, second.bytes);
 

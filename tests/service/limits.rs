@@ -187,7 +187,7 @@ async fn labs_without_quotas_have_default_ones() {
     let detail = app.post("/v1/jobs", &job).await.problem(429, "queue_full");
     assert!(detail.contains("of this lab"), "{detail}");
     let upload = app.request(Method::POST, "/v1/blobs").body(vec![1; 1_000_000]);
-    app.send(upload).await.problem(507, "quota_exceeded");
+    app.send(upload).await.problem(403, "quota_exceeded");
     let me = app.get("/v1/me").await.expect(200).json();
     assert_eq!(
         (&me["limits"]["lab_jobs"], &me["limits"]["lab_bytes"]),

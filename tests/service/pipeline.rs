@@ -80,7 +80,9 @@ async fn a_job_reconstructs_the_scene() {
         // The files are EXR and PNG of each frame, the stack, the array and the manifest.
         assert_eq!(files.len(), 4 + 4 + 4);
         for file in files {
-            let answer = app.get(file["href"].as_str().unwrap()).await.expect(200);
+            // Relative to the address of the snapshot.
+            let href = format!("/v1/jobs/{job}/snapshots/{}", file["href"].as_str().unwrap());
+            let answer = app.get(&href).await.expect(200);
             assert_eq!(answer.bytes.len() as u64, file["size"].as_u64().unwrap());
             assert_eq!(
                 answer.header("etag"),

@@ -69,7 +69,9 @@ async fn a_sequence_is_reconstructed_jointly_and_blended() {
     single_body["snapshots"] = json!(0);
     let (single_body, _) = done(&alone, &single_body).await;
     let single_body = results_of(&alone, &single_body, 1).await;
-    assert!(single_body.iter().all(|(name, hash)| each.get(name) == Some(hash)));
+    // Pictures show the white level of the whole job.
+    let mut files = single_body.iter().filter(|(name, _)| !name.ends_with(".png"));
+    assert!(files.all(|(name, hash)| each.get(name) == Some(hash)));
 
     // The camera's times show a pause.
     let data = app.upload(SCENE.snapshots()).await;

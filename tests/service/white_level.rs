@@ -85,17 +85,21 @@ async fn pictures_movies_and_quality_share_the_white_level_of_the_job() {
     assert_eq!(app.ended(&job).await["state"], "succeeded");
 
     // The white level is the 99.9th percentile of the frames of both snapshots.
-    let file = |snapshot: usize, name: &str| format!("/v1/jobs/{job}/snapshots/{snapshot}/{name}");
+    let file =
+        |snapshot: usize, name: &str| format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/{name}");
+    let view = |snapshot: usize, name: &str| {
+        format!("/view/jobs/{job}/snapshots/{snapshot}/pictures/{name}")
+    };
     let mut all = Vec::new();
     for snapshot in 0..2 {
-        all.extend(values(&app.get(&file(snapshot, "frames.npy")).await.expect(200).bytes));
+        all.extend(values(&app.get(&file(snapshot, "npy")).await.expect(200).bytes));
     }
     let first = all[..all.len() / 2].to_vec();
     all.sort_by(f32::total_cmp);
     let expected = all[all.len() - all.len() / 1000 - 1];
     let mut whites = Vec::new();
     for snapshot in 0..2 {
-        let manifest = app.get(&file(snapshot, "manifest.json")).await.expect(200).json();
+        let manifest = app.get(&file(snapshot, "manifest")).await.expect(200).json();
         let scale = &manifest["content"]["scale"];
         let white = scale["white_level"].as_f64().unwrap() as f32;
         assert!((white / expected - 1.0).abs() < 0.01, "{white}, not {expected}");
@@ -105,14 +109,14 @@ async fn pictures_movies_and_quality_share_the_white_level_of_the_job() {
     assert_eq!(whites[0], whites[1]);
 
     // Pictures and PNG show it as white; a request may state other values.
-    let spread = app.get(&file(1, "pictures/frame-1/spread")).await.expect(200).json();
+    let spread = app.get(&view(1, "frame-1/spread")).await.expect(200).json();
     assert_eq!(
         (&spread["low"], spread["high"].as_f64().map(|high| high as f32)),
         (&json!(0.0), Some(whites[0]))
     );
     let bright = (0..first.len() / 8).find(|at| first[*at] > 0.5).unwrap();
     for (query, white) in [("", whites[0]), ("?white=2", 2.0), ("?black=0&white=1", 1.0)] {
-        let picture = app.get(&file(0, &format!("pictures/frame-1{query}"))).await.expect(200);
+        let picture = app.get(&view(0, &format!("frame-1{query}"))).await.expect(200);
         let (_, _, shown) = decode(&picture);
         let level = (255.0 * first[bright] / white).round().min(255.0);
         assert!(
@@ -121,24 +125,30 @@ async fn pictures_movies_and_quality_share_the_white_level_of_the_job() {
             shown[bright]
         );
     }
-    let movie = async |query: &str| loop {
-        let answer = app.get(&file(0, &format!("movie.mp4{query}"))).await;
-        if answer.status != 202 {
-            break answer.expect(200).bytes;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    let movie = async |window: Value| {
+        let mut request = json!({"format": "mp4", "snapshot": 0});
+        request.as_object_mut().unwrap().extend(window.as_object().unwrap().clone());
+        let created = app.post(&format!("/v1/jobs/{job}/exports"), &request).await;
+        assert!([200, 202].contains(&created.status.as_u16()), "{created:?}");
+        app.get_until(&file(0, "mp4"), 200).await.bytes
     };
-    let plain = movie("").await;
-    let dark = movie("?white=20").await;
+    let plain = movie(json!({})).await;
+    let dark = movie(json!({"white": 20.0})).await;
     assert_ne!(plain, dark);
-    assert_eq!(movie("").await, plain);
-    app.get(&file(0, "movie.mp4?white=-1")).await.problem(400, "invalid_query");
+    assert_eq!(movie(json!({})).await, plain);
+    let wrong = json!({"format": "mp4", "snapshot": 0, "white": -1.0});
+    let refused = app.post(&format!("/v1/jobs/{job}/exports"), &wrong).await;
+    assert!(refused.problem(422, "invalid_request").contains("black must be below white"));
 
     // A measured PSNR has the same peak as the expected one.
     let truth = (0..8).flat_map(|k| (0..64 * 96).map(move |at| pixel(0, k, at / 96, at % 96)));
     let truth: Vec<f32> = truth.collect();
     let sha256 = app.upload(npy(&[8, 64, 96], truth.iter().copied())).await;
-    let quality = app.get(&file(0, &format!("quality?truth={sha256}"))).await.expect(200).json();
+    let quality = app
+        .get(&format!("/v1/jobs/{job}/snapshots/0/quality?truth={sha256}"))
+        .await
+        .expect(200)
+        .json();
     assert_eq!(quality["peak"].as_f64().map(|peak| peak as f32), Some(whites[0]));
     let mse = |k: usize| {
         let frame = k * 64 * 96..(k + 1) * 64 * 96;

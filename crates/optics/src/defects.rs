@@ -150,6 +150,17 @@ pub struct Defects {
     pub saturated: usize,
     /// Value from which on pixels are saturated.
     pub level: Option<f32>,
+    /// True if the snapshot has exactly two values, as the masks of a modulator do.
+    pub is_binary: bool,
+}
+
+/// True if there are exactly two values apart from NaN.
+fn is_binary(values: &Array2<f32>) -> bool {
+    let finite = || values.iter().copied().filter(|value| value.is_finite());
+    let (low, high) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
+        (low.min(value), high.max(value))
+    });
+    low < high && finite().all(|value| value == low || value == high)
 }
 
 impl Defects {
@@ -168,6 +179,11 @@ impl Defects {
             }
         });
         found.missing = values.iter().filter(|value| value.is_nan()).count();
+        found.is_binary = is_binary(values);
+        if found.is_binary {
+            // No photograph has two values, so none of them is a limit of the sensor or an outlier.
+            return found;
+        }
         let y = dark.map_or_else(|| values.clone(), |dark| &*values - dark);
         for place in outliers(y.view(), light, step) {
             values[place] = f32::NAN;
@@ -195,7 +211,11 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
     const LEFT_OUT: &str = "They are left out of the reconstruction";
     let share = |count: usize| count as f64 / pixels.max(1) as f64;
     let mut findings = Vec::new();
-    let Defects { missing, outliers, saturated, level } = *defects;
+    let Defects { missing, outliers, saturated, level, is_binary } = *defects;
+    if is_binary {
+        let detail = "the snapshot has only two values, as masks have";
+        findings.push(Finding::new(FindingCode::BinaryMeasurement, detail));
+    }
     if let (Some(level), true) = (level, share(saturated) > REPORTED_SHARE) {
         let detail = format!(
             "{:.2} % of the pixels are at {level} or above, the limit of the sensor: they were saturated. {LEFT_OUT}",

@@ -62,6 +62,7 @@ pub enum FindingCode {
     Saturated,
     BadPixels,
     EmptySnapshot,
+    BinaryMeasurement,
     LeftAligned,
     RightAligned,
     Level,
@@ -256,6 +257,13 @@ impl FindingCode {
                 Error,
                 "pixels are hot, dead, or marked as not measured",
                 "nothing, if there are few; name a map of the sensor's bad pixels as `bad_pixels` of the calibration",
+            ),
+            Self::BinaryMeasurement => (
+                &[Measurement],
+                Error,
+                Error,
+                "a snapshot has only two values, as masks have",
+                "send the snapshots of the camera as the measurement, and the masks to the calibration",
             ),
             Self::EmptySnapshot => (
                 &[Measurement],

@@ -78,7 +78,8 @@ impl HeldOutMeasurement<'_> {
             .stages
             .first()
             .is_some_and(|stage| stage.prior.tv().is_some_and(|tv| tv.temporal_weight == 0.0));
-        let order = if is_frame_by_frame { Order::of(first_stage) } else { None };
+        let order =
+            if is_frame_by_frame { Order::of(first_stage, self.whole.masks()) } else { None };
         let evidence = Evidence::new(signs, &features(self.whole, early, last));
         Some(Evidence { prediction, order, ..evidence })
     }

@@ -3,7 +3,8 @@
 //! A prior that works frame by frame commutes with an exchange of masks: the frames are exchanged with them. In a scene that
 //! moves steadily, frames differ the more the farther they are apart in time. So the sum of the squared steps from frame to
 //! frame is smallest in the right order, and each exchange of two frames is a permutation test. In a static scene no order
-//! is better than another.
+//! is better than another. Similar masks leave similar errors in their frames, whatever the scene is: only masks that are
+//! independent of one another allow the test.
 
 use ndarray::{Array2, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
@@ -14,7 +15,7 @@ use serde::{Deserialize, Serialize};
 pub enum Order {
     /// Every exchange of two frames makes the steps longer. The reversed order has the same steps.
     Consistent,
-    /// The scene hardly moves, or too fast: some exchange makes no difference.
+    /// The scene hardly moves or too fast, so some exchange makes no difference; or masks resemble one another.
     NotVerifiable,
     /// An exchange of two frames, counted from 0, makes the steps much shorter.
     Exchanged(usize, usize),
@@ -29,14 +30,20 @@ const SHORTER_T: f64 = 4.0;
 const LONGER: f64 = 1.01;
 const LONGER_T: f64 = 2.0;
 
+/// Largest correlation between two independent masks. Random squares and the rotating circle have 0.8.
+const INDEPENDENT: f64 = 0.1;
+
 impl Order {
-    /// Tests the order of the frames \\[B,H,W\\] of a snapshot, which a prior without a link along time made. `None` for fewer
-    /// than three frames, or pictures of less than four blocks.
-    pub fn of(frames: ArrayView3<'_, f32>) -> Option<Self> {
+    /// Tests the order of the frames \\[B,H,W\\] of a snapshot, which a prior without a link along time made, behind `masks`
+    /// \\[B,H,W\\]. `None` for fewer than three frames, or pictures of less than four blocks.
+    pub fn of(frames: ArrayView3<'_, f32>, masks: ArrayView3<'_, f32>) -> Option<Self> {
         let distances = block_distances(frames);
         let count = frames.len_of(Axis(0));
         if count < 3 || distances.len() < 4 {
             return None;
+        }
+        if largest_correlation(masks) > INDEPENDENT {
+            return Some(Self::NotVerifiable);
         }
         let given: Vec<usize> = (0..count).collect();
         let steps = |order: &[usize], block: &Array2<f64>| -> f64 {
@@ -67,6 +74,28 @@ impl Order {
             None => Self::NotVerifiable,
         })
     }
+}
+
+/// Largest absolute correlation between two masks.
+fn largest_correlation(masks: ArrayView3<'_, f32>) -> f64 {
+    let centred: Vec<Vec<f64>> = masks
+        .outer_iter()
+        .map(|mask| {
+            let mean = mask.iter().map(|value| f64::from(*value)).sum::<f64>() / mask.len() as f64;
+            mask.iter().map(|value| f64::from(*value) - mean).collect()
+        })
+        .collect();
+    let product =
+        |one: &[f64], other: &[f64]| -> f64 { one.iter().zip(other).map(|(a, b)| a * b).sum() };
+    let pairs = centred
+        .iter()
+        .enumerate()
+        .flat_map(|(at, one)| centred[at + 1..].iter().map(move |other| (one, other)));
+    let correlation = |(one, other): (&Vec<f64>, &Vec<f64>)| {
+        let scale = (product(one, one) * product(other, other)).sqrt();
+        if scale > 0.0 { product(one, other).abs() / scale } else { 0.0 }
+    };
+    pairs.map(correlation).fold(0.0, f64::max)
 }
 
 /// Squared distances \\[B,B\\] between the frames in each block.
@@ -108,7 +137,7 @@ mod tests {
     use crate::schedule::Schedule;
     use crate::solver::reconstruct;
     use ndarray::{Array3, Axis};
-    use optics::iid_masks;
+    use optics::{iid_masks, random_squares};
 
     /// The order of frames of total variation, after masks `a` and `b` were exchanged.
     fn test(speed: f32, (a, b): (usize, usize)) -> Option<Order> {
@@ -124,7 +153,7 @@ mod tests {
         let op = SensingOperator::new(masks.select(Axis(0), &order)).unwrap();
         let schedule = Schedule::gap_tv();
         let frames = reconstruct(&op, y.view(), &schedule, &mut (), &mut ()).unwrap().frames;
-        Order::of(frames.view())
+        Order::of(frames.view(), op.masks())
     }
 
     #[test]
@@ -133,6 +162,15 @@ mod tests {
         assert_eq!(test(1.5, (2, 6)), Some(Order::Exchanged(2, 6)));
         assert_eq!(test(1.5, (1, 4)), Some(Order::Exchanged(1, 4)));
         assert_eq!(test(0.0, (2, 6)), Some(Order::NotVerifiable));
-        assert_eq!(Order::of(Array3::zeros((2, 96, 96)).view()), None);
+        let two = Array3::zeros((2, 96, 96));
+        assert_eq!(Order::of(two.view(), two.view()), None);
+    }
+
+    /// Their frames resemble one another as their masks do, in the right order too.
+    #[test]
+    fn masks_that_resemble_one_another_show_no_order() {
+        let (masks, _) = random_squares(8, 96, 96, 1).unwrap();
+        let frames = masks.mapv(|mask| 0.5 + 0.1 * mask);
+        assert_eq!(Order::of(frames.view(), masks.view()), Some(Order::NotVerifiable));
     }
 }

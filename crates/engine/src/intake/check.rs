@@ -152,6 +152,7 @@ fn defect_findings(defects: &[Defects], pixels: usize) -> Vec<Finding> {
         worst
     };
     let kinds = [
+        (worst(|defects| usize::from(defects.is_binary)), FindingCode::BinaryMeasurement),
         (worst(|defects| defects.saturated), FindingCode::Saturated),
         (worst(|defects| defects.outliers + defects.missing), FindingCode::BadPixels),
     ];
