@@ -30,6 +30,8 @@ const LOCAL_MOSAIC_SIGNIFICANCE: f64 = 5.0;
 const MAX_GREEN_DIFFERENCE: f64 = 0.25;
 /// A drift is reported if the masks are displaced by at least this many pixels.
 const MIN_DRIFT: f64 = 0.12;
+/// Displaced masks explain less than this share of the fine structure. A wrong dark leaves the fine structure alone.
+const MAX_EXPLAINED_BY_DRIFTED: f64 = 0.8;
 /// Offsets below this share of the mean are not reported.
 const OFFSET_SHARE: f64 = 0.03;
 /// A block counts as negative if its mean is below minus this share of the mean of the measurement. The noise of a
@@ -594,6 +596,7 @@ fn drifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
     let (rows, columns) = figures.drift;
     let share = figures.offset / figures.mean;
     let significant = rows.hypot(columns) > MIN_DRIFT
+        && figures.explained_unshifted < MAX_EXPLAINED_BY_DRIFTED
         && figures.mean > 0.0
         && share.abs() > OFFSET_SHARE
         && figures.offset.abs() > 4.0 * figures.offset_uncertainty;
