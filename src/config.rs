@@ -48,7 +48,7 @@ pub struct ServeArguments {
     #[arg(long = "host", env = "SCI_RECON_HOSTS", value_name = "NAME", value_delimiter = ',')]
     pub hosts: Vec<String>,
 
-    /// Origins of pages on other hosts or ports that may use the API with a token, such as https://lab.example, separated
+    /// Origins of pages on other hosts or ports that may use the API with a token, such as `https://lab.example`, separated
     /// by commas. Without tokens they may use it freely.
     #[arg(long = "cors-origin", env = "SCI_RECON_CORS_ORIGINS", value_name = "ORIGIN", value_delimiter = ',',
           value_parser = origin)]

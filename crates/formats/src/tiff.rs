@@ -255,7 +255,7 @@ struct Page {
 impl Page {
     /// True if samples do not fill whole bytes.
     fn is_packed(&self) -> bool {
-        self.bits % 8 != 0
+        !self.bits.is_multiple_of(8)
     }
 
     fn row_bytes(&self) -> usize {
@@ -355,11 +355,9 @@ fn check_storage<R: Read + Seek>(
         let found = format_args!("predictor {predictor} with compression number {compression}");
         return Err(tags.refused(found, ACCEPTED_PREDICTOR));
     }
-    if bits > 8 && !bits.is_multiple_of(8) {
-        if !tags.is_plain()? {
-            let found = format_args!("{bits}-bit samples in tiles or compressed");
-            return Err(tags.refused(found, ACCEPTED_SAMPLES));
-        }
+    if bits > 8 && !bits.is_multiple_of(8) && !tags.is_plain()? {
+        let found = format_args!("{bits}-bit samples in tiles or compressed");
+        return Err(tags.refused(found, ACCEPTED_SAMPLES));
     }
     let reversed = tags.number(Tag::FillOrder, 1)? == 2;
     let integers = [SampleType::Bool, SampleType::U8, SampleType::U16].contains(&sample);

@@ -7,7 +7,7 @@
 //! rises at the start of a stage whose noise level is far above the remaining error, and falls again with that level. So a
 //! stage is run to its end before it is judged.
 //!
-//! Stage by stage, the candidates of a small grid ([`GRID`]) replace the planned settings where their smallest hold-out error
+//! Stage by stage, the candidates of a small grid (`GRID`) replace the planned settings where their smallest hold-out error
 //! is significantly smaller. The last stage then ends early where its error is smallest.
 
 use std::ops::ControlFlow;

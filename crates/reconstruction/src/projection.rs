@@ -83,7 +83,7 @@ impl<'a> Projection<'a> {
     }
 
     /// Compares rows of frame `k`, which are denoised, with the last iterate. A prior that works strip by strip calls this
-    /// once for each row, while the row is in cache; else [`Projection::finish`] compares all rows.
+    /// once for each row, while the row is in cache; else `Projection::finish` compares all rows.
     pub fn compare(&mut self, denoised: &Array3<f32>, k: usize, rows: Range<usize>) {
         self.change.get_or_insert_default().add(denoised, &self.iterate.v, k, rows);
     }

@@ -70,7 +70,7 @@ fn bipolar_masks_are_refused_and_noise_is_not() {
         Err(error @ FormatError::BipolarMasks { .. }) => error.to_string(),
         other => panic!("{other:?}"),
     };
-    let sign = |k: usize| if (k * 7919 % 101) % 2 == 0 { 1.0 } else { -1.0 };
+    let sign = |k: usize| if (k * 7919 % 101).is_multiple_of(2) { 1.0 } else { -1.0 };
     let at = |(k, i, j): (usize, usize, usize)| k * 1024 + i * 32 + j;
     let hadamard = Array3::from_shape_fn((2, 32, 32), |place| sign(at(place)));
     assert_names(
