@@ -155,7 +155,8 @@ async fn random_kills_lose_and_change_nothing() {
                 let begin =
                     tus(&app, Method::POST, "/v1/uploads").header("upload-length", bytes.len());
                 if let Some(created) = answer(begin).await.filter(|created| created.status == 201) {
-                    let path = created.header("location").to_owned();
+                    // Relative to the address of the request.
+                    let path = format!("/v1/{}", created.header("location"));
                     while !resume(&app, &path, &bytes).await {
                         if !app.is_running() {
                             app.restart();
