@@ -121,6 +121,8 @@ class JobList {
     if (state) this.query.set("state", state);
     if (search) this.query.set("search", search);
     this.items = [];
+    /** The cursor after a job, by its identifier; known for the last job of each page. */
+    this.cursors = new Map();
     this.complete = false;
     this.loading = null;
   }
@@ -152,21 +154,23 @@ class JobList {
   async refresh(first) {
     this.read = Date.now();
     this.take(null, await this.page(null));
-    if (first >= PAGE) {
-      const cursor = this.items[first - 1]?.id;
-      if (cursor) this.take(cursor, await this.page(cursor));
-    }
+    if (first >= PAGE) await this.next(first);
+  }
+
+  /** Reads the page that follows one of the first `count` jobs, the last one with a known cursor. */
+  async next(count) {
+    const start = this.items.slice(0, count).findLast((job) => this.cursors.has(job.id))?.id ?? null;
+    const page = await this.page(this.cursors.get(start) ?? null);
+    this.take(start, page);
+    return page !== null;
   }
 
   /** Loads the next page; true if there was one. */
   async more() {
     if (this.complete || this.loading || this.items.length === 0) return false;
-    const cursor = this.items.at(-1).id;
-    this.loading = this.page(cursor);
+    this.loading = this.next(this.items.length);
     try {
-      const page = await this.loading;
-      if (page) this.take(cursor, page);
-      return page !== null;
+      return await this.loading;
     } finally {
       this.loading = null;
     }
@@ -175,10 +179,12 @@ class JobList {
   /** Replaces the range of a page. Identifiers descend from top to bottom. */
   take(after, page) {
     if (!page) return;
-    const last = page.next_cursor;
+    const more = page.next_cursor !== null && page.items.length > 0;
+    const last = page.items.at(-1)?.id;
+    if (more) this.cursors.set(last, page.next_cursor);
     const before = this.items.filter((job) => after !== null && job.id >= after);
-    const behind = last === null ? [] : this.items.filter((job) => job.id < last);
-    if (last === null) this.complete = true;
+    const behind = more ? this.items.filter((job) => job.id < last) : [];
+    if (!more) this.complete = true;
     else if (behind.length === 0) this.complete = false;
     this.items = [...before, ...page.items, ...behind];
   }
