@@ -411,7 +411,7 @@ async fn cancel_stops_running_tasks_at_their_heartbeat() {
     assert_eq!(lab.state(job).await, JobState::Cancelled);
     assert!(lab.claim().await.is_none());
     lab.store.retry_job(&engine::job::Lab::local(), job).await.unwrap();
-    assert_eq!(lab.work_off().await.len(), 10);
+    assert_eq!(lab.work_off().await.len(), 11);
     assert!(matches!(
         lab.store.cancel_job(&engine::job::Lab::local(), job).await,
         Err(StoreError::State(_))

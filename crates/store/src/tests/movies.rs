@@ -37,8 +37,8 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
     assert!(movies.iter().all(|movie| done[..2].contains(movie)), "{done:?}");
     lab.job(other).await;
     let one = lab.store.movie(&job, Some(1)).await.unwrap();
-    let all = lab.store.create_movie(&job, None, &Value::Null).await.unwrap();
-    let (Some(Movie::Ready { sha256: one, .. }), Movie::Ready { sha256: all, size: 10 }) =
+    let all = lab.store.movie(&job, None).await.unwrap();
+    let (Some(Movie::Ready { sha256: one, .. }), Some(Movie::Ready { sha256: all, size: 10 })) =
         (one, all)
     else {
         panic!()
@@ -83,7 +83,7 @@ async fn a_movie_takes_its_labs_turn_in_a_queue_that_never_ends() {
     }
     // Jobs of both labs have begun.
     lab.work_on(6).await;
-    lab.store.movie(&job, Some(0)).await.unwrap();
+    lab.store.create_movie(&job, Some(0), &Value::Null).await.unwrap();
     let mut before = 0;
     loop {
         let task = lab.claim().await.unwrap();
@@ -95,7 +95,7 @@ async fn a_movie_takes_its_labs_turn_in_a_queue_that_never_ends() {
     }
     assert!(before <= 3, "{before} tasks came before it");
     // An administrator's urgent job comes first.
-    lab.store.movie(&job, None).await.unwrap();
+    lab.store.create_movie(&job, None, &Value::Null).await.unwrap();
     lab.submit(5).await;
     assert_eq!(lab.claim().await.unwrap().kind, TaskKind::Prepare);
 }
