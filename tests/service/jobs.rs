@@ -86,7 +86,7 @@ async fn a_key_belongs_to_one_job() {
     let repeated = with_key(&app, "run-1", &body).await.expect(200);
     assert_eq!(id(&first), id(&repeated));
     assert_eq!(first.header("location"), repeated.header("location"));
-    // The same request has another form.
+    // Defaults that are written out do not make another request.
     let mut spelled = body.clone();
     spelled["snapshots"] = json!("all");
     spelled["priority"] = json!(0);

@@ -470,15 +470,7 @@ mod tests {
         incomplete[2] = None;
         assert!(assess(incomplete).is_none());
         // Tiles without light do not contribute.
-        let (levels, motion) = (vec![DARK; 8], 0.0);
-        let dark = TileAssessment {
-            size: (2, 2),
-            levels,
-            motion,
-            unfamiliar: false,
-            prediction: None,
-            order: None,
-        };
+        let dark = TileAssessment { levels: vec![DARK; 8], motion: 0.0, ..tile(0) };
         assert!(assess(vec![Some(dark.clone()); 4]).is_none());
         let mut lit = tiles([25; 4]);
         lit[3] = Some(dark);
