@@ -33,17 +33,17 @@ fn deep(measurement: &str) -> Value {
     })
 }
 
-async fn with_library(body: &str) -> (tempfile::TempDir, TestApp) {
+async fn with_library(body: &str, stall_seconds: &str) -> (tempfile::TempDir, TestApp) {
     let folder = tempfile::tempdir().unwrap();
     let library = library(folder.path(), body);
     let library = library.to_str().unwrap();
-    let arguments = ["--workers", "1", "--stall-seconds", "1", "--onnxruntime", library];
+    let arguments = ["--workers", "1", "--stall-seconds", stall_seconds, "--onnxruntime", library];
     (folder, TestApp::with(&arguments).await)
 }
 
 #[tokio::test]
 async fn a_hanging_task_is_retried_and_abandoned() {
-    let (folder, app) = with_library("for (;;) pause();").await;
+    let (folder, app) = with_library("for (;;) pause();", "1").await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let done = app.ended(&app.submit(&deep(&measurement)).await).await;
     assert_eq!(done["state"], "failed", "{done:#}");
@@ -56,7 +56,7 @@ async fn a_hanging_task_is_retried_and_abandoned() {
 
 #[tokio::test]
 async fn a_task_that_kills_its_workers_is_abandoned() {
-    let (_folder, app) = with_library("abort();").await;
+    let (_folder, app) = with_library("abort();", "1").await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let done = app.ended(&app.submit(&deep(&measurement)).await).await;
     assert_eq!(done["state"], "failed", "{done:#}");
@@ -78,7 +78,7 @@ async fn a_task_that_kills_its_workers_is_abandoned() {
 
 #[tokio::test]
 async fn a_hanging_network_delays_no_other_check_and_is_abandoned() {
-    let (_folder, app) = with_library("for (;;) pause();").await;
+    let (_folder, app) = with_library("for (;;) pause();", "1").await;
     let (calibration, _) = app.scene(&Scene::SMALL).await;
     let file = app.upload(b"a network".to_vec()).await;
     let body = json!({"calibration": calibration, "file": file});
@@ -187,7 +187,7 @@ async fn a_task_that_exceeds_the_memory_limit_is_abandoned() {
     let Some(group) = Group::new(300 << 20) else { return };
     let greedy = "for (;;) { char *p = malloc(1 << 20); if (!p) abort();
         for (int i = 0; i < 1 << 20; i += 4096) p[i] = 1; usleep(2000); }";
-    let (_folder, app) = with_library(greedy).await;
+    let (_folder, app) = with_library(greedy, "60").await;
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     // Child processes inherit the group. The worker that runs already is outside.
     group.add(app.pid());
@@ -196,8 +196,6 @@ async fn a_task_that_exceeds_the_memory_limit_is_abandoned() {
     let done = app.ended(&job).await;
     assert_eq!(done["state"], "failed", "{done:#}");
     let error = done["error"].as_str().unwrap();
-    // The metrics below count these five. On a busy machine the task may also be lost in other
-    // ways.
     assert!(error.contains("no memory left") && error.contains(" attempts)"), "{error}");
     let peak = error.split("it used ").nth(1).and_then(|text| text.split(' ').next());
     let peak: u64 = peak.and_then(|peak| peak.parse().ok()).unwrap_or_default();
@@ -207,6 +205,9 @@ async fn a_task_that_exceeds_the_memory_limit_is_abandoned() {
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");
     let figures = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
-    assert!(figures.contains("sci_recon_worker_exits_total{reason=\"starved\"} 5"), "{figures}");
+    let exits = "sci_recon_worker_exits_total{reason=\"starved\"} ";
+    let exits = figures.lines().find_map(|line| line.strip_prefix(exits)?.parse().ok());
+    // The task takes five workers. The group may also end a worker that waits.
+    assert!(matches!(exits, Some(5..=10)), "{figures}");
     drop(app);
 }
