@@ -1,4 +1,4 @@
-"""Writes files of every format in `docs/DATA.md` to FOLDER, with the libraries that labs use.
+"""Writes files of every format in `docs/DATA.md` and `conversions.md` to FOLDER, with the libraries that labs use.
 
 `index.json` in FOLDER lists, for each file, its row in the tables and the fields of its request. A file holds masks
 [4, 48, 64] of 0 and 1, or snapshots [2, 48, 64] from 0 to 250.

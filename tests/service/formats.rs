@@ -1,4 +1,4 @@
-//! Compares each row of the tables in `docs/DATA.md` with files from the programs of labs.
+//! Compares each row of the tables of formats and conversions with files from the programs of labs.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -17,9 +17,9 @@ use crate::samples::{npy, npy_header};
 /// A table row: its first cell, and its command if there is one.
 type Row = (String, Option<String>);
 
-/// Rows of the first table below this heading.
-fn rows(heading: &str) -> Vec<Row> {
-    let text = std::fs::read_to_string("docs/DATA.md").unwrap();
+/// Rows of the first table below this heading of a document.
+fn rows(document: &str, heading: &str) -> Vec<Row> {
+    let text = std::fs::read_to_string(document).unwrap();
     let (_, below) = text.split_once(heading).unwrap();
     let lines = below.lines().skip_while(|line| !line.starts_with("| ---")).skip(1);
     let row = |line: &str| {
@@ -139,13 +139,14 @@ fn run(command: &mut Command) {
 #[tokio::test]
 async fn every_row_of_the_tables_holds() {
     let Some((judge, files)) = Judge::new().await else { return };
-    let (accepted, refused) = (rows("## Supported input formats"), rows("## Convert other files"));
+    let accepted = rows("docs/DATA.md", "## Supported input formats");
+    let refused = rows("tests/judges/conversions.md", "# Conversions of refused files");
     let rows_of_files: BTreeSet<&str> =
         accepted.iter().chain(&refused).map(|(row, _)| &**row).collect();
     let written: BTreeSet<&str> = files.iter().map(|file| &*file.row).collect();
     assert_eq!(
         rows_of_files, written,
-        "rows of docs/DATA.md (left) differ from tests/judges/written_files.py (right)"
+        "rows of the tables (left) differ from tests/judges/written_files.py (right)"
     );
     for file in &files {
         let (path, mut asked) = (judge.folder.path().join(&file.file), file.asked());
