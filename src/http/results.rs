@@ -170,6 +170,7 @@ pub(super) fn media_type(name: &str) -> &'static str {
         Some("exr") => "image/x-exr",
         Some("png") => "image/png",
         Some("mp4") => "video/mp4",
+        Some("gif") => "image/gif",
         Some("json") => "application/json",
         _ => "application/octet-stream",
     }

@@ -70,6 +70,7 @@ def main():
         k, i, j = np.indices(result.snapshot(1).shape)
         assert (error == blocks[k, i // 16, j // 16]).all()
         assert result.assessment == client.job(result.job.id).record["assessment"] is not None
+        assert result.movie(format="gif").read_bytes()[:6] == b"GIF89a"
         for movie in (result.movie(), result.movie(snapshot=1)):
             assert movie.read_bytes()[4:8] == b"ftyp" and movie.parent.parent == folder / "result"
         assert not list(stack.parent.glob("*.part"))

@@ -26,13 +26,14 @@ def main():
         with urllib.request.urlopen(request) as answer:
             return answer.status, answer.headers, answer.read()
 
-    def made(place, snapshot):
-        status, fields, _ = get("/exports", {"format": "mp4", "snapshot": snapshot})
-        assert status in (200, 202) and fields["Location"] == f"{place}/exports/mp4".lstrip("/"), fields
+    def made(place, snapshot, movie_format, media_type):
+        file = f"{place}/exports/{movie_format}"
+        status, fields, _ = get("/exports", {"format": movie_format, "snapshot": snapshot})
+        assert status in (200, 202) and fields["Location"] == file.lstrip("/"), fields
         while True:
-            status, fields, content = get(f"{place}/exports/mp4")
+            status, fields, content = get(file)
             if status == 200:
-                assert fields["Content-Type"] == "video/mp4" and int(fields["Content-Length"]) == len(content)
+                assert fields["Content-Type"] == media_type and int(fields["Content-Length"]) == len(content)
                 return content
             assert status == 202 and int(fields["Retry-After"]) > 0
             body = json.loads(content)
@@ -50,7 +51,7 @@ def main():
     told = {"psnr_db": [], "bytes": {}}
     for snapshot, expected in clips.items():
         place = "" if snapshot is None else f"/snapshots/{snapshot}"
-        content = made(place, snapshot)
+        content = made(place, snapshot, "mp4", "video/mp4")
         with av.open(io.BytesIO(content)) as movie:
             stream = movie.streams.video[0]
             assert stream.codec_context.name == "libdav1d" and stream.average_rate == 10
@@ -65,8 +66,21 @@ def main():
             error = np.square(frame - picture.reshape(*frame.shape[:2], -1).astype(float)).mean()
             told["psnr_db"].append(round(10 * np.log10(255**2 / max(error, 1e-9)), 2))
         told["bytes"][place] = len(content)
+        compare_gif(made(place, snapshot, "gif", "image/gif"), expected)
     assert min(told["psnr_db"]) > 40, told
     print(json.dumps(told))
+
+
+def compare_gif(content, expected):
+    """Grey levels are exact; rounding to 16 bits first may differ by one. A frame of colours has 256 of them."""
+    with Image.open(io.BytesIO(content)) as movie:
+        assert movie.n_frames == len(expected) and movie.info["loop"] == 0
+        for index, picture in enumerate(expected):
+            movie.seek(index)
+            assert movie.info["duration"] == 100
+            error = np.abs(np.asarray(movie.convert("RGB"), float) - picture.reshape(*picture.shape[:2], -1))
+            psnr_db = 10 * np.log10(255**2 / max(np.square(error).mean(), 1e-9))
+            assert error.max() <= 1 if picture.ndim == 2 else psnr_db > 28, (psnr_db, error.max())
 
 
 def levels(picture):

@@ -83,15 +83,15 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     let watched = lab.text(&["watch", &job]).await;
     assert!(watched.starts_with(&format!("{job} succeeded: ")), "{watched}");
     let everything = [
-        "frames.npy,stack.exr,stack-sigma.exr,stack.tif,movie.mp4,frames,png,manifest.json",
-        "sequence.npy,sequence.mp4",
+        "frames.npy,stack.exr,stack-sigma.exr,stack.tif,movie.mp4,movie.gif,frames,png,manifest.json",
+        "sequence.npy,sequence.mp4,sequence.gif",
     ];
     let line =
         ["fetch", &job, "--out", "out", "--json", "--file", everything[0], "--file", everything[1]];
     let fetched = lab.json(&line).await;
-    // Each snapshot has array, stacks, movie, manifest, and EXR and PNG of each frame. The sequence
-    // has manifest, array and movie.
-    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (6 + 2 * 8) + 3, "{fetched:#}");
+    // Each snapshot has array, stacks, movies, manifest, and EXR and PNG of each frame. The sequence
+    // has manifest, array and movies.
+    assert_eq!(fetched["files"].as_array().unwrap().len(), 2 * (7 + 2 * 8) + 4, "{fetched:#}");
     for file in [
         "snapshot_0001/frames.npy",
         "snapshot_0000/png/frame_0003.png",
@@ -99,16 +99,20 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
         "snapshot_0001/stack-sigma.exr",
         "sequence.npy",
         "sequence.mp4",
+        "snapshot_0000/movie.gif",
+        "sequence.gif",
     ] {
         let (subfolder, name) = file.split_once('/').unwrap_or(("", file));
         let path = match (subfolder, name) {
             ("", "sequence.npy") => "exports/npy".to_owned(),
+            ("", "sequence.gif") => "exports/gif".to_owned(),
             ("", _) => "exports/mp4".to_owned(),
             _ => {
                 let format = match name {
                     "frames.npy" => "npy",
                     "png/frame_0003.png" => "frames/3.png",
                     "movie.mp4" => "mp4",
+                    "movie.gif" => "gif",
                     _ => "exr?layers=sigma",
                 };
                 format!("snapshots/{}/exports/{format}", &subfolder[12..])

@@ -248,7 +248,7 @@ async fn a_movie_is_encoded_on_request_and_stored_like_a_result() {
 }
 
 #[tokio::test]
-async fn the_smallest_frames_have_no_movie() {
+async fn the_smallest_frames_have_only_a_gif() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (_, measurement) =
         app.scene(&Scene { frames: 2, height: 48, width: 12, snapshots: 1 }).await;
@@ -258,6 +258,10 @@ async fn the_smallest_frames_have_no_movie() {
     app.get(&path).await.problem(404, "not_found");
     let detail = app.create_movie(&job, None).await.problem(404, "not_found");
     assert!(detail.contains("48x12") && detail.contains("below 16"), "{detail}");
+    let gif = app.post(&format!("/v1/jobs/{job}/exports"), &json!({"format": "gif"})).await;
+    assert_eq!(gif.expect(202).header("location"), format!("/v1/jobs/{job}/exports/gif"));
+    let gif = app.movie(&format!("/v1/jobs/{job}/exports/gif")).await.expect(200);
+    assert_eq!((gif.header("content-type"), &gif.bytes[..6]), ("image/gif", &b"GIF89a"[..]));
 }
 
 #[tokio::test]

@@ -32,6 +32,7 @@ mod zip;
 
 pub mod bigtiff;
 pub mod exr;
+pub mod gif;
 pub mod mat;
 pub mod movie;
 pub mod npy;

@@ -216,7 +216,9 @@ impl Lab {
                 let array = file(&folder, "frames.npy", "pixels");
                 Product::Files(folder, vec![frame, array])
             }
-            TaskKind::Movie { snapshot } => self.blob(&format!("movie {snapshot:?}")),
+            TaskKind::Movie { snapshot } | TaskKind::Gif { snapshot } => {
+                self.blob(&format!("movie {snapshot:?}"))
+            }
             TaskKind::Check => panic!("what passes depends on the request"),
             TaskKind::Calibration => Product::Calibration(Box::new(calibrations::report())),
             TaskKind::Manifest => {

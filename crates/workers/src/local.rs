@@ -120,7 +120,10 @@ impl Local {
                 tasks: tasks(&task.records, attempt)?,
                 folder: folder()?,
             },
-            TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
+            TaskKind::Check
+            | TaskKind::Calibration
+            | TaskKind::Movie { .. }
+            | TaskKind::Gif { .. } => {
                 return Err(missing_input(kind).into());
             }
         })
@@ -281,7 +284,7 @@ fn white_level(record: &Value) -> Result<f32, PipelineError> {
 }
 
 fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
-    let MovieWork { spec, measurement, white, window, arrays, .. } = work;
+    let MovieWork { spec, format, measurement, white, window, arrays, .. } = work;
     let window = match window {
         Some(window) => parsed("movie", window)?,
         None => DisplayWindow {
@@ -294,6 +297,7 @@ fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
     let record = CameraRecord::new((facts.camera_fps, facts.exposure_s), 0, frames);
     let exposure = record.and_then(|record| record.frame_exposure_s(frames));
     Ok(MovieTask {
+        format: *format,
         shape: spec.shape,
         window,
         requested: work.window.is_some(),

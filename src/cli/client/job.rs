@@ -53,6 +53,9 @@ pub(in crate::cli) enum Wanted {
     /// A movie of each snapshot.
     #[value(name = "movie.mp4")]
     Movie,
+    /// A movie of each snapshot for presentation programs. Grey levels are exact.
+    #[value(name = "movie.gif")]
+    Gif,
     /// The frames of a colour sensor before demosaicking, float32.
     #[value(name = "mosaic.npy")]
     Mosaic,
@@ -77,6 +80,9 @@ pub(in crate::cli) enum Wanted {
     /// A movie of all snapshots.
     #[value(name = "sequence.mp4")]
     SequenceMovie,
+    /// A movie of all snapshots for presentation programs.
+    #[value(name = "sequence.gif")]
+    SequenceGif,
     /// All files as one archive.
     #[value(name = "results.zip")]
     Archive,
@@ -103,9 +109,11 @@ impl Wanted {
             Self::StackWithError
             | Self::Tiff
             | Self::Movie
+            | Self::Gif
             | Self::SequenceArray
             | Self::SequenceTiff
             | Self::SequenceMovie
+            | Self::SequenceGif
             | Self::Archive => false,
         }
     }
@@ -117,6 +125,7 @@ impl Wanted {
             Self::SequenceArray => Some(("exports/npy", "sequence.npy")),
             Self::SequenceTiff => Some(("exports/tiff", "sequence.tif")),
             Self::SequenceMovie => Some(("exports/mp4", "sequence.mp4")),
+            Self::SequenceGif => Some(("exports/gif", "sequence.gif")),
             Self::Archive => Some(("exports/zip", "results.zip")),
             _ => None,
         }
@@ -202,6 +211,7 @@ impl Client {
                 (Wanted::StackWithError, "exr?layers=sigma", "stack-sigma.exr"),
                 (Wanted::Tiff, "tiff", "stack.tif"),
                 (Wanted::Movie, "mp4", "movie.mp4"),
+                (Wanted::Gif, "gif", "movie.gif"),
             ];
             for (export, query, name) in exports {
                 if wanted.contains(&export) {
@@ -209,12 +219,16 @@ impl Client {
                     files.push((href, snapshot_folder.join(name), None));
                 }
             }
-            if wanted.contains(&Wanted::Movie) {
-                self.create_movie(&base, Some(snapshot)).await?;
+            for (movie, format) in [(Wanted::Movie, "mp4"), (Wanted::Gif, "gif")] {
+                if wanted.contains(&movie) {
+                    self.create_movie(&base, Some(snapshot), format).await?;
+                }
             }
         }
-        if wanted.contains(&Wanted::SequenceMovie) {
-            self.create_movie(&base, None).await?;
+        for (movie, format) in [(Wanted::SequenceMovie, "mp4"), (Wanted::SequenceGif, "gif")] {
+            if wanted.contains(&movie) {
+                self.create_movie(&base, None, format).await?;
+            }
         }
         for (query, name) in wanted.iter().filter_map(|wanted| wanted.job_file()) {
             files.push((format!("{base}/{query}"), folder.join(name), None));
@@ -229,8 +243,8 @@ impl Client {
     }
 
     /// Has the service encode a movie of a snapshot of a job, or of all; it may exist already.
-    async fn create_movie(&self, job: &str, snapshot: Option<u32>) -> Result<()> {
-        let body = serde_json::json!({"format": "mp4", "snapshot": snapshot});
+    async fn create_movie(&self, job: &str, snapshot: Option<u32>, format: &str) -> Result<()> {
+        let body = serde_json::json!({"format": format, "snapshot": snapshot});
         self.post(&format!("{job}/exports"), &body).await.map(|_| ())
     }
 

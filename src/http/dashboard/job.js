@@ -142,8 +142,9 @@ async function showFiles(element, { id, state, shape, snapshots: { count } }, sn
   put(element, h("b", null, "Download"), whole.map((file) => link(file, file.name === "stack.exr")),
     ready && has("error.npy") && made(`${own}/exr?layers=sigma`, "EXR stack with expected error"),
     ready && made(`${own}/tiff`, "TIFF stack"),
-    ready && moves && movieLink(base, snapshot, "Movie", signal),
-    ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "Movie of all snapshots", signal),
+    ready && moves && movieLink(base, snapshot, "mp4", "Movie", signal),
+    ready && movieLink(base, snapshot, "gif", "GIF for presentations", signal),
+    ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "mp4", "Movie of all snapshots", signal),
     ready && state === "succeeded" && made(`${base}/exports/zip`, "All files as ZIP"),
     h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;

@@ -10,12 +10,12 @@ const POLL_MS = 1000;
 const links = new WeakMap();
 
 /**
- * A link that creates the movie of a snapshot of the job at `job`, or of all snapshots, shows the progress, and then
- * downloads it.
+ * A link that creates the movie of a snapshot of the job at `job`, or of all snapshots, as `mp4` or `gif`. It shows the
+ * progress, and then downloads the movie.
  */
-export function movieLink(job, snapshot, text, signal) {
-  const path = snapshot === null ? `${job}/exports/mp4` : `${job}/snapshots/${snapshot}/exports/mp4`;
-  const create = () => send("POST", `${job}/exports`, { format: "mp4", snapshot });
+export function movieLink(job, snapshot, format, text, signal) {
+  const path = `${job}${snapshot === null ? "" : `/snapshots/${snapshot}`}/exports/${format}`;
+  const create = () => send("POST", `${job}/exports`, { format, snapshot });
   const own = links.get(signal) ?? new Map();
   links.set(signal, own);
   if (!own.has(path)) own.set(path, make(path, text, create, signal));

@@ -2,6 +2,8 @@
 
 use serde::Deserialize;
 
+use engine::job::MovieFormat;
+
 /// The formats, as paths name them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -16,6 +18,8 @@ pub(in crate::http) enum Format {
     Zarr,
     /// A movie.
     Mp4,
+    /// A movie for presentations.
+    Gif,
     /// Each frame of a snapshot as EXR and PNG, which is a tree of files.
     Frames,
     /// Frames of a colour sensor before demosaicking.
@@ -26,4 +30,13 @@ pub(in crate::http) enum Format {
     Manifest,
     /// All files of a job.
     Zip,
+}
+
+impl From<MovieFormat> for Format {
+    fn from(format: MovieFormat) -> Self {
+        match format {
+            MovieFormat::Mp4 => Self::Mp4,
+            MovieFormat::Gif => Self::Gif,
+        }
+    }
 }

@@ -17,6 +17,7 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Params, QueryOf};
 use super::results::{frame_file, send};
 use clip::Clip;
+use engine::job::MovieFormat;
 use format::Format;
 pub(super) use movie::create;
 
@@ -53,7 +54,8 @@ pub(super) async fn file(
         (Format::Npy, Some(_)) => stored(&clip, "frames.npy", request).await,
         (Format::Npy, None) => clip::array(clip, request).await,
         (Format::Tiff, _) => clip::tiff(clip, request).await,
-        (Format::Mp4, _) => movie::movie(clip, request).await,
+        (Format::Mp4, _) => movie::movie(clip, MovieFormat::Mp4, request).await,
+        (Format::Gif, _) => movie::movie(clip, MovieFormat::Gif, request).await,
         (Format::Mosaic, Some(_)) if clip.job.spec.shape.mosaic.is_none() => {
             let detail = "the sensor of this job is grey: npy has its frames";
             Err(ApiError::new(Code::NotFound, detail))

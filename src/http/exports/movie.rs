@@ -13,12 +13,10 @@ use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Body, Caller, Params};
 use super::super::results::{file_name, media_type, white_level};
 use super::clip::Clip;
-use super::format::Format;
-use engine::job::{JobId, MIN_MOVIE_SIDE};
+use engine::job::{JobId, MIN_MOVIE_SIDE, MovieFormat};
 use engine::pipeline::movie::DisplayWindow;
 use store::{Movie, StoreError};
 
-const NAME: &str = "movie.mp4";
 /// Seconds after which to ask again.
 const AGAIN: HeaderValue = HeaderValue::from_static("1");
 
@@ -27,21 +25,13 @@ const AGAIN: HeaderValue = HeaderValue::from_static("1");
 #[serde(deny_unknown_fields)]
 #[derive(schemars::JsonSchema)]
 pub(in crate::http) struct ExportRequest {
-    format: CreatedFormat,
+    format: MovieFormat,
     /// The snapshot; by default all snapshots of the job, in order.
     snapshot: Option<u32>,
     /// The value of the frames to show as black; by default 0.
     black: Option<f32>,
     /// The value of the frames to show as white; by default the job's white level.
     white: Option<f32>,
-}
-
-/// Formats that a worker makes on request. The service composes all others while a client reads them.
-#[derive(Debug, Clone, Copy, Deserialize)]
-#[serde(rename_all = "snake_case")]
-#[derive(schemars::JsonSchema)]
-enum CreatedFormat {
-    Mp4,
 }
 
 /// An export that a worker makes.
@@ -69,39 +59,45 @@ pub(in crate::http) async fn create(
     Params(id): Params<JobId>,
     Body(request): Body<ExportRequest>,
 ) -> Result<Response> {
-    let ExportRequest { format: CreatedFormat::Mp4, snapshot, black, white } = request;
+    let ExportRequest { format, snapshot, black, white } = request;
     let job = app.store.job(&access.lab, id).await?;
     if let Some(missing) = snapshot.filter(|snapshot| !job.spec.snapshots.contains(*snapshot)) {
         return Err(ApiError::field("/snapshot", format!("the job has no snapshot {missing}")));
     }
     let base = snapshot.map_or(String::new(), |snapshot| format!("/snapshots/{snapshot}"));
-    let place = format!("/v1/jobs/{id}{base}/exports/mp4");
-    let clip = Clip { app, job, snapshot, format: Format::Mp4 };
-    check(&clip).await?;
+    let place = format!("/v1/jobs/{id}{base}/exports/{}", extension(format));
+    let clip = Clip { app, job, snapshot, format: format.into() };
+    check(&clip, format).await?;
     let window = display_window(&clip.app, id, (black, white)).await?;
-    let (status, body) = match clip.app.store.create_movie(&clip.job, snapshot, &window).await? {
-        Movie::Ready { .. } => {
-            (StatusCode::OK, ExportBody { state: ExportState::Ready, percent: 100.0 })
-        }
-        Movie::Asked(fraction) => (StatusCode::ACCEPTED, pending(fraction)),
-        Movie::Failed(reason) => return Err(failed(&reason)),
-    };
+    let (status, body) =
+        match clip.app.store.create_movie(&clip.job, (snapshot, format), &window).await? {
+            Movie::Ready { .. } => {
+                (StatusCode::OK, ExportBody { state: ExportState::Ready, percent: 100.0 })
+            }
+            Movie::Asked(fraction) => (StatusCode::ACCEPTED, pending(fraction)),
+            Movie::Failed(reason) => return Err(failed(&reason)),
+        };
     Ok((status, [(header::LOCATION, place)], [(header::RETRY_AFTER, AGAIN)], Json(body))
         .into_response())
 }
 
-/// `mp4`: AV1, at ten frames per second.
-pub(super) async fn movie(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
-    check(&clip).await?;
-    match clip.app.store.movie(&clip.job, clip.snapshot).await? {
+/// A movie, at ten frames per second.
+pub(super) async fn movie(
+    clip: Clip,
+    format: MovieFormat,
+    request: (&Method, &HeaderMap),
+) -> Result<Response> {
+    check(&clip, format).await?;
+    match clip.app.store.movie(&clip.job, clip.snapshot, format).await? {
         Some(Movie::Ready { sha256, size }) => {
             let file = match clip.app.store.open_blob(sha256).await {
-                Err(StoreError::Damaged { .. }) => return Err(missing()),
+                Err(StoreError::Damaged { .. }) => return Err(missing(format)),
                 file => file?,
             };
-            let name = file_name(clip.job.id, clip.snapshot, NAME);
+            let name = format!("movie.{}", extension(format));
+            let kind = media_type(&name);
+            let name = file_name(clip.job.id, clip.snapshot, &name);
             let disposition = format!("inline; {name}");
-            let kind = media_type(NAME);
             let download = Download { sha256, size, kind, disposition, in_parts: true };
             download.send(async { Ok(file) }, request).await
         }
@@ -113,15 +109,15 @@ pub(super) async fn movie(clip: Clip, request: (&Method, &HeaderMap)) -> Result<
             Ok((StatusCode::ACCEPTED, fields, Json(pending(fraction))).into_response())
         }
         Some(Movie::Failed(reason)) => Err(failed(&reason)),
-        None => Err(missing()),
+        None => Err(missing(format)),
     }
 }
 
 /// Refuses frames that have no movie, or that are not there.
-async fn check(clip: &Clip) -> Result<()> {
-    if !clip.job.spec.has_movie() {
+async fn check(clip: &Clip, format: MovieFormat) -> Result<()> {
+    if !clip.job.spec.has_movie(format) {
         let detail = format!(
-            "there is no movie of frames of {}x{}: it would have a side below {MIN_MOVIE_SIDE} pixels",
+            "frames of {}x{} have no MP4, because a side would be below {MIN_MOVIE_SIDE} pixels; they have a GIF",
             clip.job.spec.shape.height, clip.job.spec.shape.width
         );
         return Err(ApiError::new(Code::NotFound, detail));
@@ -156,10 +152,20 @@ fn pending(fraction: Option<f64>) -> ExportBody {
     ExportBody { state, percent: (fraction.unwrap_or(0.0) * 1000.0).round() / 10.0 }
 }
 
-fn missing() -> ApiError {
-    let detail = "there is no movie yet: POST {\"format\": \"mp4\"} to exports of the job, with the snapshot, \
-                  creates it";
+fn missing(format: MovieFormat) -> ApiError {
+    let detail = format!(
+        "there is no movie yet: POST {{\"format\": \"{}\"}} to exports of the job, with the snapshot, creates it",
+        extension(format)
+    );
     ApiError::new(Code::NotFound, detail)
+}
+
+/// The name of the format in paths, and the extension of its files.
+fn extension(format: MovieFormat) -> &'static str {
+    match format {
+        MovieFormat::Mp4 => "mp4",
+        MovieFormat::Gif => "gif",
+    }
 }
 
 fn failed(reason: &str) -> ApiError {

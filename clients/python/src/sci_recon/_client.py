@@ -573,18 +573,22 @@ class Result:
                 transfer.download(self.job.client.http, href, path, file["sha256"], bar)
         return path
 
-    def movie(self, snapshot: int | None = None) -> Path:
-        """Creates the movie (AV1 in MP4, ten frames per second) of a snapshot, or of all in order, and fetches it."""
+    def movie(self, snapshot: int | None = None, format: str = "mp4") -> Path:
+        """Creates the movie of a snapshot, or of all in order, and fetches it.
+
+        `format` is "mp4" (AV1) or "gif", which presentation programs play.
+        """
         http = self.job.client.http
         base = f"/v1/jobs/{self.job.id}"
-        transfer.send(http, "POST", f"{base}/exports", json={"format": "mp4", "snapshot": snapshot})
-        href = f"{base}/exports/mp4" if snapshot is None else f"{base}/snapshots/{snapshot}/exports/mp4"
+        transfer.send(http, "POST", f"{base}/exports", json={"format": format, "snapshot": snapshot})
+        href = f"{base}/exports/{format}" if snapshot is None else f"{base}/snapshots/{snapshot}/exports/{format}"
         while (answer := transfer.send(http, "HEAD", href)).status_code == 202:
             transfer.pause(0, answer.headers.get("Retry-After"))
         sha256 = answer.headers["ETag"].strip('"')
-        path = self.folder / ("sequence" if snapshot is None else f"snapshot_{snapshot:04d}") / "movie.mp4"
+        place = "sequence" if snapshot is None else f"snapshot_{snapshot:04d}"
+        path = self.folder / place / f"movie.{format}"
         if not (path.is_file() and transfer.sha256(path) == sha256):
-            with self.job.client._bar("download movie.mp4") as bar:
+            with self.job.client._bar(f"download {path.name}") as bar:
                 transfer.download(http, href, path, sha256, bar)
         return path
 

@@ -41,7 +41,7 @@ pub use submission::{
     CalibrationRequest, CheckLimits, MeasurementRequest, ModelRequest, Submission,
 };
 pub use task::{
-    MIN_MOVIE_SIDE, MOVIE_SIDE, ResultFile, TaskKind, TaskProgress, TaskStage, TaskState,
-    movie_step,
+    MIN_MOVIE_SIDE, MOVIE_SIDE, MovieFormat, ResultFile, TaskKind, TaskProgress, TaskStage,
+    TaskState, movie_step,
 };
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};

@@ -20,6 +20,8 @@ const PREVIEW_WHOLE_S: f64 = 120e-9;
 const MOVIE_S: f64 = 700e-9;
 /// Largest planned CPU seconds of a task that the light worker takes, checks excepted: an upload may wait that long.
 const LIGHT_S: f64 = 1.0;
+/// CPU seconds per sample of a GIF (measured; colours take the most).
+const GIF_S: f64 = 100e-9;
 /// Longest side of a movie in pixels.
 pub const MOVIE_SIDE: usize = 1920;
 /// Shortest side of a movie in pixels; the AV1 encoder accepts no smaller ones.
@@ -60,6 +62,29 @@ pub enum TaskKind {
     Calibration,
     /// Encodes a requested movie of one snapshot, or of all snapshots of a job.
     Movie { snapshot: Option<u32> },
+    /// Writes such a movie as a GIF.
+    Gif { snapshot: Option<u32> },
+}
+
+/// The format of a movie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[derive(schemars::JsonSchema)]
+pub enum MovieFormat {
+    /// AV1 in MP4, which browsers and video players play.
+    Mp4,
+    /// GIF, which presentation programs play. Grey levels are exact.
+    Gif,
+}
+
+impl MovieFormat {
+    /// The task that writes the movie of a snapshot, or of all snapshots for `None`.
+    pub fn task(self, snapshot: Option<u32>) -> TaskKind {
+        match self {
+            Self::Mp4 => TaskKind::Movie { snapshot },
+            Self::Gif => TaskKind::Gif { snapshot },
+        }
+    }
 }
 
 impl TaskKind {
@@ -69,7 +94,7 @@ impl TaskKind {
             Self::Preview { snapshot }
             | Self::Tile { snapshot, .. }
             | Self::Assemble { snapshot } => Some(snapshot),
-            Self::Movie { snapshot } => snapshot,
+            Self::Movie { snapshot } | Self::Gif { snapshot } => snapshot,
             Self::Prepare
             | Self::Pilot
             | Self::White
@@ -105,7 +130,8 @@ impl TaskKind {
             | Self::White
             | Self::Assemble { .. }
             | Self::Manifest
-            | Self::Movie { .. } => cost <= LIGHT_S,
+            | Self::Movie { .. }
+            | Self::Gif { .. } => cost <= LIGHT_S,
             Self::Pilot | Self::Tile { .. } | Self::Calibration => false,
         }
     }
@@ -127,6 +153,7 @@ impl TaskKind {
             ("check", None, None) => Some(Self::Check),
             ("calibration", None, None) => Some(Self::Calibration),
             ("movie", snapshot, None) => Some(Self::Movie { snapshot }),
+            ("gif", snapshot, None) => Some(Self::Gif { snapshot }),
             _ => None,
         }
     }
@@ -186,23 +213,34 @@ impl JobSpec {
 
     /// Planned CPU seconds of the movie of one snapshot, or of all snapshots for `None`.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
-    pub fn movie_cost(&self, snapshot: Option<u32>) -> f64 {
+    pub fn movie_cost(&self, format: MovieFormat, snapshot: Option<u32>) -> f64 {
         let SceneShape { frames, height, width, .. } = self.shape;
         let snapshots = if snapshot.is_some() { 1 } else { self.snapshots.count as usize };
         let samples = snapshots * frames * height * width * self.shape.channels().count();
-        samples as f64 * READ_S + self.movie_bytes(snapshot) as f64 * MOVIE_S
+        let written = snapshots as u64 * frames as u64 * self.movie_samples();
+        let sample_s = match format {
+            MovieFormat::Mp4 => MOVIE_S,
+            MovieFormat::Gif => GIF_S,
+        };
+        samples as f64 * READ_S + written as f64 * sample_s
     }
 
-    /// Upper bound, in bytes, of the movie of one snapshot, or of all snapshots for `None`: one byte per sample.
-    pub fn movie_bytes(&self, snapshot: Option<u32>) -> u64 {
+    /// Upper bound, in bytes, of the movie of one snapshot, or of all snapshots for `None`: one byte per sample of an
+    /// MP4. GIF codes a pixel of noise with up to 12 bits.
+    pub fn movie_bytes(&self, format: MovieFormat, snapshot: Option<u32>) -> u64 {
         let snapshots = if snapshot.is_some() { 1 } else { u64::from(self.snapshots.count) };
-        snapshots * self.shape.frames as u64 * self.movie_samples()
+        let samples = snapshots * self.shape.frames as u64 * self.movie_samples();
+        match format {
+            MovieFormat::Mp4 => samples,
+            MovieFormat::Gif => samples.div_ceil(2) * 3 + (1 << 10) * self.shape.frames as u64,
+        }
     }
 
-    /// True if the frames are large enough for a movie.
-    pub fn has_movie(&self) -> bool {
+    /// True if the frames are large enough for a movie in this format.
+    pub fn has_movie(&self, format: MovieFormat) -> bool {
         let SceneShape { height, width, .. } = self.shape;
-        height.min(width).div_ceil(movie_step(height, width)) >= MIN_MOVIE_SIDE
+        format == MovieFormat::Gif
+            || height.min(width).div_ceil(movie_step(height, width)) >= MIN_MOVIE_SIDE
     }
 
     /// Number of samples in a frame of a movie.

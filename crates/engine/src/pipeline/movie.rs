@@ -1,19 +1,19 @@
 //! Movies of the frames of one snapshot, or of several consecutive ones.
 
 use std::fs::File;
-use std::io::{BufWriter, Seek, Write};
+use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Axis, s};
+use ndarray::{Array2, ArrayView2, Axis, s};
 use serde::{Deserialize, Serialize};
 
 use super::error::{PipelineError, Result};
 use super::progress::Monitor;
-use crate::job::{SceneShape, Sha256, TaskStage, movie_step};
+use crate::job::{MovieFormat, SceneShape, Sha256, TaskStage, movie_step};
+use formats::gif::{self, GifWriter};
 use formats::movie::{self, Clip, MovieWriter};
-use formats::{Channels, Limits, WindowReader, npy, png};
+use formats::{Channels, FormatError, Limits, WindowReader, npy, png};
 
-const NAME: &str = "movie.mp4";
 /// Number of samples that are read at a time: 16 MiB.
 const BAND_SAMPLES: usize = 4 << 20;
 
@@ -27,6 +27,7 @@ pub struct DisplayWindow {
 /// The input of a movie.
 #[derive(Debug)]
 pub struct MovieTask {
+    pub format: MovieFormat,
     pub shape: SceneShape,
     /// Values that are displayed as black and as white.
     pub window: DisplayWindow,
@@ -56,13 +57,14 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
         title: &title,
     };
     let file = File::options().write(true).open(path);
-    let file = file.map_err(|source| PipelineError::File { name: NAME.into(), source })?;
-    let mut writer = movie::writer(BufWriter::new(file), &clip)?;
+    let file = file.map_err(|source| PipelineError::File { name: "movie".into(), source })?;
+    let mut writer = Writer::new(task.format, BufWriter::new(file), &clip)?;
     for (index, (array, sha256)) in task.clips.iter().enumerate() {
         let reader = open_checked(array, *sha256)?;
         monitor.check()?;
         for k in 0..frames {
-            write_frame(&mut writer, &reader, k, (channels, step, task.window))?;
+            let frame = levels(&reader, k, (channels, step, task.window))?;
+            writer.write_frame(frame.view())?;
             monitor.check()?;
             let done = (index * frames + k + 1) as f64 / count as f64;
             monitor.reach(TaskStage::Writing, done);
@@ -70,6 +72,39 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
     }
     writer.finish()?;
     Ok(())
+}
+
+/// The writer of a format.
+enum Writer {
+    Mp4(Box<MovieWriter<BufWriter<File>>>),
+    Gif(Box<GifWriter<BufWriter<File>>>),
+}
+
+impl Writer {
+    fn new(
+        format: MovieFormat,
+        file: BufWriter<File>,
+        clip: &Clip<'_>,
+    ) -> Result<Self, FormatError> {
+        Ok(match format {
+            MovieFormat::Mp4 => Self::Mp4(Box::new(movie::writer(file, clip)?)),
+            MovieFormat::Gif => Self::Gif(Box::new(gif::writer(file, clip)?)),
+        })
+    }
+
+    fn write_frame(&mut self, frame: ArrayView2<'_, u8>) -> Result<(), FormatError> {
+        match self {
+            Self::Mp4(writer) => writer.write_frame(frame),
+            Self::Gif(writer) => writer.write_frame(frame),
+        }
+    }
+
+    fn finish(self) -> Result<(), FormatError> {
+        match self {
+            Self::Mp4(writer) => writer.finish().map(drop),
+            Self::Gif(writer) => writer.finish().map(drop),
+        }
+    }
 }
 
 /// Opens the frames of a snapshot after a check of their hash.
@@ -83,13 +118,12 @@ fn open_checked(path: &Path, expected: Sha256) -> Result<WindowReader> {
     Ok(npy::open_windows(path, &Limits::default())?)
 }
 
-/// Reads frame `k` in bands of rows, and adds it to the movie.
-fn write_frame<W: Write + Seek>(
-    writer: &mut MovieWriter<W>,
+/// Reads frame `k` in bands of rows, as levels from 0 to 255.
+fn levels(
     reader: &WindowReader,
     k: usize,
     (channels, step, window): (Channels, usize, DisplayWindow),
-) -> Result<()> {
+) -> Result<Array2<u8>> {
     let DisplayWindow { black, white } = window;
     let (height, samples) = (reader.info().height, reader.info().width);
     let width = samples / channels.count();
@@ -103,7 +137,7 @@ fn write_frame<W: Write + Seek>(
         let values = block_means(values.index_axis_move(Axis(0), 0), channels, step);
         levels.slice_mut(s![start..end, ..]).assign(&values.map(png::level_u8(black, white)));
     }
-    Ok(writer.write_frame(levels.view())?)
+    Ok(levels)
 }
 
 /// Means of blocks of `step` x `step` pixels. Blocks at the last row and column may be smaller.
@@ -131,7 +165,7 @@ mod tests {
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
     use super::{DisplayWindow, MovieTask, block_means, write};
-    use crate::job::{SceneShape, Sha256};
+    use crate::job::{MovieFormat, SceneShape, Sha256};
     use crate::pipeline::PipelineError;
     use crate::pipeline::progress::Monitor;
     use formats::{Channels, npy};
@@ -145,6 +179,7 @@ mod tests {
         let sha256 = Sha256::of(&std::fs::read(&array).unwrap());
         let shape = SceneShape { frames: 2, height: 77, width: 3841, snapshots: 2, mosaic: None };
         let task = |sha256| MovieTask {
+            format: MovieFormat::Mp4,
             shape,
             window: DisplayWindow { black: 0.0, white: 4.0 },
             requested: false,

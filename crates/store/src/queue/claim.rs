@@ -18,8 +18,8 @@ use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
 use crate::tables::workers::{self, WorkerTakes};
 use engine::job::{
-    CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Sha256, Submission, TaskKind,
-    TaskStage, TaskState, ThingId, Timestamp, WorkerId,
+    CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, MovieFormat, Sha256,
+    Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
 };
 
 /// The longest pause of a task after a failure, in milliseconds: one that ends later was noted before
@@ -90,6 +90,7 @@ pub struct CalibrationTask {
 pub struct MovieWork {
     pub job: JobId,
     pub spec: JobSpec,
+    pub format: MovieFormat,
     pub measurement: Measurement,
     /// The record of the job's white level.
     pub white: Option<Value>,
@@ -285,7 +286,12 @@ impl Store {
             Owner::Job(job) => self.job_task(job, kind).await,
             Owner::Thing(id) => match kind {
                 TaskKind::Check => self.check_task(id).await,
-                TaskKind::Movie { snapshot } => self.movie_work(id.into(), snapshot).await,
+                TaskKind::Movie { snapshot } => {
+                    self.movie_work(id.into(), snapshot, MovieFormat::Mp4).await
+                }
+                TaskKind::Gif { snapshot } => {
+                    self.movie_work(id.into(), snapshot, MovieFormat::Gif).await
+                }
                 _ => self.calibration_task(id.into()).await,
             },
         }
@@ -335,14 +341,19 @@ impl Store {
         })))
     }
 
-    async fn movie_work(&self, job: JobId, snapshot: Option<u32>) -> Result<Work> {
+    async fn movie_work(
+        &self,
+        job: JobId,
+        snapshot: Option<u32>,
+        format: MovieFormat,
+    ) -> Result<Work> {
         let job = self.job_of_any_lab(job).await?;
         let measurement = self.find_measurement(None, job.spec.measurement).await?;
         let white: Option<Json<Value>> =
             sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job.id])
                 .fetch_one(&self.readers)
                 .await?;
-        let window = self.movie_window(job.id, snapshot).await?;
+        let window = self.movie_window(job.id, format.task(snapshot)).await?;
         let mut arrays = Vec::new();
         for snapshot in
             snapshot.map_or_else(|| job.spec.snapshots.indices().collect(), |one| vec![one])
@@ -351,7 +362,8 @@ impl Store {
             arrays.push((path, file.sha256));
         }
         let white = white.map(|json| json.0);
-        let work = MovieWork { job: job.id, spec: job.spec, measurement, white, window, arrays };
+        let (job, spec) = (job.id, job.spec);
+        let work = MovieWork { job, spec, format, measurement, white, window, arrays };
         Ok(Work::Movie(Box::new(work)))
     }
 

@@ -85,7 +85,9 @@ impl Store {
                 result = Some(staged.sha256());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }
-            (Owner::Thing(_), Product::File(staged)) if matches!(kind, TaskKind::Movie { .. }) => {
+            (Owner::Thing(_), Product::File(staged))
+                if matches!(kind, TaskKind::Movie { .. } | TaskKind::Gif { .. }) =>
+            {
                 result = Some(staged.sha256());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }

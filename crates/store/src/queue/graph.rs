@@ -68,7 +68,7 @@ pub async fn insert_for(
     // The ordinal is the order of the tasks of one thing.
     let (priority, ordinal) = match kind {
         TaskKind::Check => (CHECK_PRIORITY, 0),
-        TaskKind::Movie { .. } => (MOVIE_PRIORITY, 1),
+        TaskKind::Movie { .. } | TaskKind::Gif { .. } => (MOVIE_PRIORITY, 1),
         _ => (CALIBRATION_PRIORITY, 1),
     };
     sql!(
@@ -95,9 +95,11 @@ pub async fn insert_for(
 /// The state of a task that waits for its turn alone, or for others.
 fn first_state(kind: TaskKind) -> TaskState {
     match kind {
-        TaskKind::Prepare | TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
-            TaskState::Ready
-        }
+        TaskKind::Prepare
+        | TaskKind::Check
+        | TaskKind::Calibration
+        | TaskKind::Movie { .. }
+        | TaskKind::Gif { .. } => TaskState::Ready,
         TaskKind::Preview { .. }
         | TaskKind::Pilot
         | TaskKind::Tile { .. }
@@ -156,9 +158,11 @@ pub(super) async fn unblock(
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE job = ?1
                                    AND kind IN ('preview', 'assemble') AND state <> ?5)"
         }
-        TaskKind::Manifest | TaskKind::Check | TaskKind::Calibration | TaskKind::Movie { .. } => {
-            return Ok(());
-        }
+        TaskKind::Manifest
+        | TaskKind::Check
+        | TaskKind::Calibration
+        | TaskKind::Movie { .. }
+        | TaskKind::Gif { .. } => return Ok(()),
     };
     sql!(
         query,

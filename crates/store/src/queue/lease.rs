@@ -377,7 +377,7 @@ fn failure_text(kind: TaskKind, attempts: u32, reason: &str) -> String {
         TaskKind::Manifest => "writing the manifest".into(),
         TaskKind::Check => "the check".into(),
         TaskKind::Calibration => "the calibration".into(),
-        TaskKind::Movie { .. } => "the movie".into(),
+        TaskKind::Movie { .. } | TaskKind::Gif { .. } => "the movie".into(),
     };
     let times = if attempts > 1 { format!(" ({attempts} attempts)") } else { String::new() };
     format!("{place}: {reason}{times}")

@@ -9,7 +9,7 @@ use crate::error::{Result, StoreError};
 use crate::tables::quota;
 use crate::tables::results::WHOLE_JOB;
 use crate::{Job, Store};
-use engine::job::{JobId, Sha256, TaskKind, TaskState};
+use engine::job::{JobId, MovieFormat, Sha256, TaskKind, TaskState};
 
 /// State of the movie of a snapshot, or of a whole job.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,13 +26,20 @@ pub enum Movie {
 
 impl Store {
     /// The movie of a snapshot of a job (or, with none, of all); none if nobody has asked for it, or if it is damaged.
-    pub async fn movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Option<Movie>> {
-        Ok(self.find_movie(job, snapshot).await?.map(|(movie, _)| movie))
+    pub async fn movie(
+        &self,
+        job: &Job,
+        snapshot: Option<u32>,
+        format: MovieFormat,
+    ) -> Result<Option<Movie>> {
+        Ok(self.find_movie(job, format.task(snapshot)).await?.map(|(movie, _)| movie))
     }
 
-    /// The movie of a snapshot, or of all, with its display window.
-    async fn find_movie(&self, job: &Job, snapshot: Option<u32>) -> Result<Option<(Movie, Value)>> {
-        let found = sql!(FIND, [job.id, place(snapshot)]).fetch_optional(&self.readers).await?;
+    /// The movie that a task makes, with its display window.
+    async fn find_movie(&self, job: &Job, task: TaskKind) -> Result<Option<(Movie, Value)>> {
+        let found = sql!(FIND, [job.id, task.into_str(), place(task)])
+            .fetch_optional(&self.readers)
+            .await?;
         let Some(row) = found else { return Ok(None) };
         let (sha256, size): (Option<Sha256>, Option<u64>) =
             (row.read("result")?, row.read("size")?);
@@ -55,27 +62,28 @@ impl Store {
     pub async fn create_movie(
         &self,
         job: &Job,
-        snapshot: Option<u32>,
+        (snapshot, format): (Option<u32>, MovieFormat),
         window: &Value,
     ) -> Result<Movie> {
-        let place = place(snapshot);
+        let task = format.task(snapshot);
         if let Some((found @ (Movie::Ready { .. } | Movie::Asked(_)), shown)) =
-            self.find_movie(job, snapshot).await?
+            self.find_movie(job, task).await?
             && shown == *window
         {
             return Ok(found);
         }
         let mut transaction = self.write().await?;
-        self.drop_movies(&mut transaction, job.id, Some(place)).await?;
-        quota::check(&mut transaction, &job.lab, None, job.spec.movie_bytes(snapshot)).await?;
+        self.drop_movies(&mut transaction, job.id, Some(task)).await?;
+        let bytes = job.spec.movie_bytes(format, snapshot);
+        quota::check(&mut transaction, &job.lab, None, bytes).await?;
         let known = sql!("SELECT 1 FROM jobs WHERE id = ?", [job.id]);
         let known = known.fetch_optional(&mut *transaction).await?;
         known.ok_or_else(|| StoreError::missing("job", job.id))?;
-        let (kind, cost) = (TaskKind::Movie { snapshot }, job.spec.movie_cost(snapshot));
-        graph::insert_for(&mut transaction, (&job.lab, job.id.into()), kind, cost).await?;
+        let cost = job.spec.movie_cost(format, snapshot);
+        graph::insert_for(&mut transaction, (&job.lab, job.id.into()), task, cost).await?;
         sql!(
-            "UPDATE tasks SET record = ? WHERE thing = ? AND coalesce(snapshot, -1) = ?",
-            [Json(window), job.id, place]
+            "UPDATE tasks SET record = ? WHERE thing = ? AND kind = ? AND coalesce(snapshot, -1) = ?",
+            [Json(window), job.id, task.into_str(), place(task)]
         )
         .execute(&mut *transaction)
         .await?;
@@ -84,27 +92,25 @@ impl Store {
     }
 
     /// The values to show as black and as white in a movie; `None` for the job's white level.
-    pub(super) async fn movie_window(
-        &self,
-        job: JobId,
-        snapshot: Option<u32>,
-    ) -> Result<Option<Value>> {
-        let found = sql!(FIND, [job, place(snapshot)]).fetch_optional(&self.readers).await?;
+    pub(super) async fn movie_window(&self, job: JobId, task: TaskKind) -> Result<Option<Value>> {
+        let found =
+            sql!(FIND, [job, task.into_str(), place(task)]).fetch_optional(&self.readers).await?;
         let window = found.map(|row| row.read_json::<Value>("record")).transpose()?.flatten();
         Ok(window.filter(|window| !window.is_null()))
     }
 
-    /// Removes the movies of a job, or that of one snapshot of it, with the tasks that make them.
+    /// Removes the movies of a job, or the one of a task, with the tasks that make them.
     pub(super) async fn drop_movies(
         &self,
         transaction: &mut SqliteConnection,
         job: JobId,
-        place: Option<i64>,
+        task: Option<TaskKind>,
     ) -> Result<()> {
         let results: Vec<Option<Sha256>> = sql_as!(
-            "DELETE FROM tasks WHERE thing = ?1 AND (?2 IS NULL OR coalesce(snapshot, -1) = ?2)
+            "DELETE FROM tasks
+             WHERE thing = ?1 AND (?2 IS NULL OR (kind = ?2 AND coalesce(snapshot, -1) = ?3))
              RETURNING result",
-            [job, place]
+            [job, task.map(|task| task.into_str()), task.map(place)]
         )
         .fetch_all(&mut *transaction)
         .await?;
@@ -120,9 +126,9 @@ const FIND: &str = "SELECT state, fraction, result, size, record,
         (SELECT reason FROM attempts WHERE task = id AND attempt = tasks.attempt) AS reason
     FROM tasks
     LEFT JOIN blobs ON sha256 = result AND damaged_at IS NULL
-    WHERE thing = ? AND coalesce(snapshot, -1) = ?";
+    WHERE thing = ? AND kind = ? AND coalesce(snapshot, -1) = ?";
 
-/// The snapshot of a movie as it is looked for.
-fn place(snapshot: Option<u32>) -> i64 {
-    snapshot.map_or(WHOLE_JOB, i64::from)
+/// The snapshot of a movie, as queries compare it.
+fn place(task: TaskKind) -> i64 {
+    task.snapshot().map_or(WHOLE_JOB, i64::from)
 }

@@ -111,7 +111,7 @@ async fn totals_equal_new_sums_after_random_operations() {
             (7, Some(job)) => drop(lab.store.retry_job(&job.lab, job.id).await),
             (8, Some(job)) => drop(lab.store.delete_job(&job.lab, job.id).await),
             (9, Some(job)) if job.state == engine::job::JobState::Succeeded => {
-                drop(lab.store.movie(&job, Some(0)).await);
+                drop(lab.store.movie(&job, Some(0), engine::job::MovieFormat::Mp4).await);
             }
             (10, _) => lab.request(&mut random).await,
             (11, _) => {
