@@ -1,5 +1,5 @@
-//! The frames of a snapshot, or of all snapshots of a job in order, as a movie. Encoding takes long, so a worker does it
-//! when a request creates the movie.
+//! The frames of a snapshot, or of all snapshots of a job in order, as a movie. Encoding takes long, so a worker encodes
+//! the movie once a client has requested it with POST.
 
 use axum::Json;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
@@ -19,8 +19,8 @@ use engine::pipeline::movie::DisplayWindow;
 use store::{Movie, StoreError};
 
 const NAME: &str = "movie.mp4";
-/// Seconds after which to ask again.
-const AGAIN: HeaderValue = HeaderValue::from_static("1");
+/// Seconds between two requests of a client that waits for a movie.
+const RETRY_SECONDS: HeaderValue = HeaderValue::from_static("1");
 
 /// The body of `POST /v1/jobs/{job}/exports`.
 #[derive(Debug, Deserialize)]
@@ -75,10 +75,10 @@ pub(in crate::http) async fn create(
         return Err(ApiError::field("/snapshot", format!("the job has no snapshot {missing}")));
     }
     let base = snapshot.map_or(String::new(), |snapshot| format!("/snapshots/{snapshot}"));
-    let place = format!("/v1/jobs/{id}{base}/exports/mp4");
+    let address = format!("/v1/jobs/{id}{base}/exports/mp4");
     let clip = Clip { app, job, snapshot, format: Format::Mp4 };
     check(&clip).await?;
-    let window = display_window(&clip.app, id, (black, white)).await?;
+    let window = requested_window(&clip.app, id, black, white).await?;
     let (status, body) = match clip.app.store.create_movie(&clip.job, snapshot, &window).await? {
         Movie::Ready { .. } => {
             (StatusCode::OK, ExportBody { state: ExportState::Ready, percent: 100.0 })
@@ -86,11 +86,11 @@ pub(in crate::http) async fn create(
         Movie::Asked(fraction) => (StatusCode::ACCEPTED, pending(fraction)),
         Movie::Failed(reason) => return Err(failed(&reason)),
     };
-    Ok((status, [(header::LOCATION, place)], [(header::RETRY_AFTER, AGAIN)], Json(body))
+    Ok((status, [(header::LOCATION, address)], [(header::RETRY_AFTER, RETRY_SECONDS)], Json(body))
         .into_response())
 }
 
-/// `mp4`: AV1, at ten frames per second.
+/// `mp4`: the movie in AV1, at ten frames per second.
 pub(super) async fn movie(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     check(&clip).await?;
     match clip.app.store.movie(&clip.job, clip.snapshot).await? {
@@ -102,12 +102,12 @@ pub(super) async fn movie(clip: Clip, request: (&Method, &HeaderMap)) -> Result<
             let name = file_name(clip.job.id, clip.snapshot, NAME);
             let disposition = format!("inline; {name}");
             let kind = media_type(NAME);
-            let download = Download { sha256, size, kind, disposition, in_parts: true };
+            let download = Download { sha256, size, kind, disposition, accepts_ranges: true };
             download.send(async { Ok(file) }, request).await
         }
         Some(Movie::Asked(fraction)) => {
             let fields = [
-                (header::RETRY_AFTER, AGAIN),
+                (header::RETRY_AFTER, RETRY_SECONDS),
                 (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
             ];
             Ok((StatusCode::ACCEPTED, fields, Json(pending(fraction))).into_response())
@@ -117,24 +117,27 @@ pub(super) async fn movie(clip: Clip, request: (&Method, &HeaderMap)) -> Result<
     }
 }
 
-/// Refuses frames that have no movie, or that are not there.
+/// Checks that the frames exist and that a movie can show them.
+///
+/// Errors: 404 if a side of the movie would be too short, or if the frames do not exist yet.
 async fn check(clip: &Clip) -> Result<()> {
     if !clip.job.spec.has_movie() {
         let detail = format!(
-            "there is no movie of frames of {}x{}: it would have a side below {MIN_MOVIE_SIDE} pixels",
+            "frames of {}x{} pixels have no movie: a side would be shorter than {MIN_MOVIE_SIDE} pixels",
             clip.job.spec.shape.height, clip.job.spec.shape.width
         );
         return Err(ApiError::new(Code::NotFound, detail));
     }
-    clip.pieces().await?;
+    clip.sources().await?;
     Ok(())
 }
 
-/// The requested values of black and white as the store keeps them; null for the job's white level.
-async fn display_window(
+/// The requested display window in the form that the store keeps. Null stands for 0 to the job's white level.
+async fn requested_window(
     app: &App,
     job: JobId,
-    (black, white): (Option<f32>, Option<f32>),
+    black: Option<f32>,
+    white: Option<f32>,
 ) -> Result<Value> {
     if black.is_none() && white.is_none() {
         return Ok(Value::Null);
@@ -143,12 +146,9 @@ async fn display_window(
         None => white_level(app, job).await?,
         white => white,
     };
-    let (black, white) = (black.unwrap_or(0.0), white.unwrap_or(1.0));
-    if !(black.is_finite() && white.is_finite() && black < white && (white - black).is_finite()) {
-        let detail = format!("black is {black} and white is {white}; black must be below white");
-        return Err(ApiError::field("/black", detail));
-    }
-    serde_json::to_value(DisplayWindow { black, white }).map_err(|error| ApiError::internal(&error))
+    let window = DisplayWindow::new(black.unwrap_or(0.0), white.unwrap_or(1.0))
+        .map_err(|error| ApiError::field("/black", error.to_string()))?;
+    serde_json::to_value(window).map_err(|error| ApiError::internal(&error))
 }
 
 fn pending(fraction: Option<f64>) -> ExportBody {
@@ -157,12 +157,12 @@ fn pending(fraction: Option<f64>) -> ExportBody {
 }
 
 fn missing() -> ApiError {
-    let detail = "there is no movie yet: POST {\"format\": \"mp4\"} to exports of the job, with the snapshot, \
-                  creates it";
+    let detail = "there is no movie yet: to create it, POST {\"format\": \"mp4\"} to exports of the job, with \
+                  the snapshot if the movie is of one";
     ApiError::new(Code::NotFound, detail)
 }
 
 fn failed(reason: &str) -> ApiError {
-    let detail = format!("{reason}. POST to exports of the job tries again");
+    let detail = format!("{reason}. To try again, POST to exports of the job");
     ApiError::new(Code::MovieFailed, detail)
 }
