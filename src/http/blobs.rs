@@ -1,4 +1,4 @@
-//! `/v1/blobs`: files by the SHA-256 of their bytes.
+//! `/v1/blobs`: uploaded files, each addressed by its SHA-256.
 
 use std::str::FromStr;
 
@@ -22,18 +22,18 @@ use super::upload;
 use engine::job::{Sha256, Timestamp};
 use store::{Blob, BlobRow, StagedBlob};
 
-/// `POST /v1/blobs`: the file as the raw body, or as the field `file` of a form.
+/// `POST /v1/blobs`: stores a file, sent as the raw body or as the field `file` of a form.
 pub(super) async fn create(
     Caller(app, access): Caller,
     headers: HeaderMap,
     request: Request,
 ) -> Result<Response> {
     let (_slot, room) = match begin(&app, &access, &headers).await {
-        Ok(begun) => begun,
-        Err(refusal) => return Err(refuse(refusal, &headers, request.into_body()).await),
+        Ok(reserved) => reserved,
+        Err(error) => return Err(reject(error, &headers, request.into_body()).await),
     };
     let staged = if is_form(&headers) {
-        // The digest is that of the form, not of the file.
+        // `Content-Digest` has the digest of the form and not of the file.
         receive_form(&app, room, request).await?
     } else {
         let staged = upload::receive(&app, room, request.into_body().into_data_stream()).await?;
@@ -43,7 +43,7 @@ pub(super) async fn create(
     store(&app, &access, staged).await
 }
 
-/// `PUT /v1/blobs/{sha256}`: the raw body, which must have this hash.
+/// `PUT /v1/blobs/{sha256}`: stores the raw body, which must have this hash.
 pub(super) async fn put(
     Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
@@ -51,19 +51,20 @@ pub(super) async fn put(
     body: Body,
 ) -> Result<Response> {
     let (_slot, room) = match begin(&app, &access, &headers).await {
-        Ok(begun) => begun,
-        Err(refusal) => return Err(refuse(refusal, &headers, body).await),
+        Ok(reserved) => reserved,
+        Err(error) => return Err(reject(error, &headers, body).await),
     };
     let staged = upload::receive(&app, room, body.into_data_stream()).await?;
     check_digest(content_digest(&headers)?, || staged.sha256())?;
     if staged.sha256() != sha256 {
-        let detail = format!("the address says {sha256}, the bytes have {}", staged.sha256());
+        let detail =
+            format!("the address has the SHA-256 {sha256}, but the bytes have {}", staged.sha256());
         return Err(ApiError::new(Code::HashMismatch, detail));
     }
     store(&app, &access, staged).await
 }
 
-/// `GET /v1/blobs/{sha256}`: whether the file is there, and its size.
+/// `GET /v1/blobs/{sha256}`: the size of the file, or 404 if the lab has not uploaded it.
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
@@ -76,11 +77,11 @@ async fn body(app: &App, access: &Access, sha256: Sha256) -> Result<Blob> {
     Ok(app.store.upload(&access.lab, sha256).await?)
 }
 
-/// The place of an upload in the list: its time and hash.
+/// Position in the list of uploads: time and hash of an upload.
 #[derive(Debug)]
-pub(super) struct Place(Timestamp, Sha256);
+pub(super) struct Position(Timestamp, Sha256);
 
-impl FromStr for Place {
+impl FromStr for Position {
     type Err = ();
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
@@ -94,7 +95,7 @@ impl FromStr for Place {
 pub(super) struct ListQuery {
     #[serde(default)]
     limit: Limit,
-    cursor: Option<Cursor<Place>>,
+    cursor: Option<Cursor<Position>>,
 }
 
 /// `GET /v1/blobs`: the lab's files, newest first.
@@ -103,14 +104,14 @@ pub(super) async fn list(
     QueryOf(query): QueryOf<ListQuery>,
     request: RequestContext,
 ) -> Result<Response> {
-    let after = query.cursor.map(|Cursor(Place(time, sha256))| (time, sha256));
+    let after = query.cursor.map(|Cursor(Position(time, sha256))| (time, sha256));
     let page = app.store.uploads(&access.lab, after, query.limit.get()).await?;
     let cursor = |row: &BlobRow| format!("{}-{}", row.blob.created_at.0, row.blob.sha256);
     PageBody::new(page, cursor, |row| row).answer(&request)
 }
 
-/// `GET /v1/blobs/{sha256}/content`: the bytes as they were sent, for the lab that sent them. No browser
-/// shows them, whatever they are.
+/// `GET /v1/blobs/{sha256}/content`: the bytes of an upload, for the lab that uploaded it. The headers keep browsers from
+/// displaying the file or running scripts in it.
 pub(super) async fn content(
     Caller(app, access): Caller,
     Params(sha256): Params<Sha256>,
@@ -123,7 +124,7 @@ pub(super) async fn content(
         size: blob.size,
         kind: "application/octet-stream",
         disposition: format!("attachment; filename=\"{sha256}.bin\""),
-        in_parts: true,
+        accepts_ranges: true,
     };
     let open = app.store.open_blob(sha256);
     let mut response = download.send(open, (&method, &headers)).await?;
@@ -144,8 +145,8 @@ pub(super) async fn delete(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Takes one of the places for uploads and reserves room on the disk; refuses an upload that says by
-/// its length that it can't be taken, before its first byte.
+/// Takes one of the places for uploads, and reserves disk space. Rejects an upload with a `Content-Length` above the limits
+/// before its first byte is read.
 async fn begin(
     app: &App,
     access: &Access,
@@ -159,13 +160,13 @@ async fn begin(
     Ok((slot, app.admission.reserve(&access.lab, length).await?))
 }
 
-/// Lets the client come to the end of a small body, so that it gets to see the refusal.
-async fn refuse(refusal: ApiError, headers: &HeaderMap, body: Body) -> ApiError {
-    // A client that waits for leave to send has none.
+/// Reads the rest of a small body before the error is sent. Some clients read the answer only after they sent the body.
+async fn reject(error: ApiError, headers: &HeaderMap, body: Body) -> ApiError {
+    // With `Expect: 100-continue` the client has not sent the body yet.
     if !headers.contains_key(header::EXPECT) {
         upload::drain(&mut body.into_data_stream()).await;
     }
-    refusal
+    error
 }
 
 fn is_form(headers: &HeaderMap) -> bool {
@@ -183,7 +184,7 @@ async fn receive_form(app: &App, room: Reservation, request: Request) -> Result<
             return upload::receive(app, room, field).await;
         }
     }
-    Err(malformed("the form has no field named file".into()))
+    Err(malformed("the form has no field named file: send the file in that field".into()))
 }
 
 async fn store(app: &App, access: &Access, staged: StagedBlob) -> Result<Response> {

@@ -1,4 +1,4 @@
-//! `/v1/calibrations`: masks of optical settings.
+//! `/v1/calibrations`: masks of optical setups.
 
 use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -137,16 +137,15 @@ impl From<Asked<Calibration>> for CalibrationBody {
 
 pub(super) async fn create(
     Caller(app, access): Caller,
-    asked: RequestContext,
+    context: RequestContext,
     Body(request): Body<CalibrationRequest>,
 ) -> Result<Response> {
-    let (key, wait) = (request_key(&asked.headers, &request)?, asked.wait());
-    let request = Submission::Calibration(request);
-    let made = make(&app, &access, request, key.as_ref(), wait.time(PATIENCE)).await?;
-    let (status, id) = created(made);
+    let (key, wait) = (request_key(&context.headers, &request)?, context.wait());
+    let submission = Submission::Calibration(request);
+    let inserted = make(&app, &access, submission, key.as_ref(), wait.time(PATIENCE)).await?;
+    let (status, id) = created(inserted);
     let body = body(&app, &access.lab, id).await?;
-    let made = body.state == Stage::Ready;
-    let status = if made { status } else { StatusCode::ACCEPTED };
+    let status = if body.state == Stage::Ready { status } else { StatusCode::ACCEPTED };
     let location = [(header::LOCATION, format!("/v1/calibrations/{id}"))];
     Ok(wait.applied((location, changed(status, &body)?).into_response()))
 }
@@ -179,8 +178,8 @@ pub(super) async fn show(
 ) -> Result<Response> {
     let wait = request.wait();
     if let Some(time) = app.wait(wait) {
-        let what = (Made::Calibration, id.into());
-        app.events.settled(&app.store, &access.lab, what, time).await?;
+        let resource = (Made::Calibration, id.into());
+        app.events.settled(&app.store, &access.lab, resource, time).await?;
     }
     Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
 }

@@ -21,30 +21,30 @@ pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     }
 }
 
-/// Refuses a request about another state of a thing than the one with this ETag (`If-Match`, compared
-/// strongly).
+/// Rejects a request if `If-Match` does not contain this ETag, compared strongly.
 pub(super) fn check_match(headers: &HeaderMap, etag: &str) -> Result<()> {
-    let wanted = headers.typed_get::<IfMatch>();
-    match (wanted, etag.parse::<ETag>()) {
-        (Some(wanted), Ok(found)) if !wanted.precondition_passes(&found) => {
-            let detail = format!("If-Match names another state than this one, which is {etag}");
+    match (headers.typed_get::<IfMatch>(), etag.parse::<ETag>()) {
+        (Some(expected), Ok(current)) if !expected.precondition_passes(&current) => {
+            let detail = format!(
+                "the ETag is {etag}, which If-Match does not contain: the resource has changed"
+            );
             Err(ApiError::new(Code::PreconditionFailed, detail))
         }
         _ => Ok(()),
     }
 }
 
-/// The ETag under which [`json`] answers with this.
+/// The ETag that [`json`] sends with this body.
 pub(super) fn etag_of<T: Serialize>(body: &T) -> Result<String> {
     let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
     Ok(etag(&Sha256::of(&text)))
 }
 
-/// Content with its ETag, or word that the client has it.
+/// Answers with content and its ETag, or with 304 if the client has it.
 pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -> Response {
     let etag = etag(&Sha256::of(&bytes));
-    if let Err(refusal) = check_match(headers, &etag) {
-        return refusal.into_response();
+    if let Err(error) = check_match(headers, &etag) {
+        return error.into_response();
     }
     let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
     if is_known(headers, &etag) {
@@ -53,54 +53,61 @@ pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -
     (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response()
 }
 
+/// Answers with a JSON body and its ETag, or with 304 if the client has it.
 pub(super) fn json<T: Serialize>(body: &T, headers: &HeaderMap) -> Result<Response> {
     let text = serde_json::to_vec(body).map_err(|error| ApiError::internal(&error))?;
     Ok(content(headers, "application/json", text))
 }
 
-/// What part of a file is asked for.
+/// The part of a file that a request asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Wanted {
+pub(super) enum RequestedRange {
     Whole,
     Part {
         start: u64,
         length: u64,
     },
-    /// Bytes that are not there.
+    /// A range after the end of the file.
     Outside,
 }
 
-/// Reads `Range` and `If-Range` for a file of `size` bytes. Ranges are defined for GET alone. Several ranges
-/// at once, other units and what can't be read are ignored, as the RFC allows: the whole file is the answer
-/// then.
-pub(super) fn wanted(method: &Method, headers: &HeaderMap, etag: &str, size: u64) -> Wanted {
+/// Parses `Range` and `If-Range` for a file of `size` bytes. Ranges are only defined for GET. Several ranges, other units
+/// and malformed ranges are ignored, as the RFC allows; the answer is then the whole file.
+pub(super) fn requested_range(
+    method: &Method,
+    headers: &HeaderMap,
+    etag: &str,
+    size: u64,
+) -> RequestedRange {
     if method != Method::GET {
-        return Wanted::Whole;
+        return RequestedRange::Whole;
     }
     let text = |name: HeaderName| headers.get(name).and_then(|value| value.to_str().ok());
-    let Some(range) = text(header::RANGE) else { return Wanted::Whole };
+    let Some(range) = text(header::RANGE) else { return RequestedRange::Whole };
     if headers.contains_key(header::IF_RANGE) && text(header::IF_RANGE) != Some(etag) {
-        return Wanted::Whole;
+        return RequestedRange::Whole;
     }
     let Some((first, last)) = range
         .strip_prefix("bytes=")
         .filter(|set| !set.contains(','))
         .and_then(|set| set.trim().split_once('-'))
     else {
-        return Wanted::Whole;
+        return RequestedRange::Whole;
     };
     match (number(first), number(last)) {
-        (Some(start), _) if last.is_empty() && start >= size => Wanted::Outside,
-        (Some(start), _) if last.is_empty() => Wanted::Part { start, length: size - start },
-        (Some(start), Some(end)) if start > end => Wanted::Whole,
-        (Some(start), Some(_)) if start >= size => Wanted::Outside,
-        (Some(start), Some(end)) => Wanted::Part { start, length: end.min(size - 1) - start + 1 },
-        (None, Some(0)) if first.is_empty() => Wanted::Outside,
+        (Some(start), _) if last.is_empty() && start >= size => RequestedRange::Outside,
+        (Some(start), _) if last.is_empty() => RequestedRange::Part { start, length: size - start },
+        (Some(start), Some(end)) if start > end => RequestedRange::Whole,
+        (Some(start), Some(_)) if start >= size => RequestedRange::Outside,
+        (Some(start), Some(end)) => {
+            RequestedRange::Part { start, length: end.min(size - 1) - start + 1 }
+        }
+        (None, Some(0)) if first.is_empty() => RequestedRange::Outside,
         (None, Some(suffix)) if first.is_empty() => {
             let length = suffix.min(size);
-            Wanted::Part { start: size - length, length }
+            RequestedRange::Part { start: size - length, length }
         }
-        _ => Wanted::Whole,
+        _ => RequestedRange::Whole,
     }
 }
 
@@ -108,17 +115,17 @@ fn number(text: &str) -> Option<u64> {
     if text.is_empty() || !text.bytes().all(|byte| byte.is_ascii_digit()) {
         return None;
     }
-    // Digits that don't fit name a byte past every file.
+    // A number that exceeds 64 bits is after the end of any file.
     Some(text.parse().unwrap_or(u64::MAX))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Wanted, check_match, is_known};
+    use super::{RequestedRange, check_match, is_known};
     use axum::http::{HeaderMap, Method};
 
-    fn wanted(headers: &HeaderMap, etag: &str, size: u64) -> Wanted {
-        super::wanted(&Method::GET, headers, etag, size)
+    fn requested_range(headers: &HeaderMap, etag: &str, size: u64) -> RequestedRange {
+        super::requested_range(&Method::GET, headers, etag, size)
     }
 
     fn headers(pairs: &[(&'static str, &'static str)]) -> HeaderMap {
@@ -126,8 +133,8 @@ mod tests {
     }
 
     #[test]
-    fn ranges_of_ten_bytes() {
-        let part = |start, length| Wanted::Part { start, length };
+    fn ranges_of_a_file_of_ten_bytes_are_parsed() {
+        let part = |start, length| RequestedRange::Part { start, length };
         for (range, expected) in [
             ("bytes=0-0", part(0, 1)),
             ("bytes=2-5", part(2, 4)),
@@ -135,38 +142,46 @@ mod tests {
             ("bytes=2-99999999999999999999999", part(2, 8)),
             ("bytes=-3", part(7, 3)),
             ("bytes=-30", part(0, 10)),
-            ("bytes=10-", Wanted::Outside),
-            ("bytes=10-12", Wanted::Outside),
-            ("bytes=99999999999999999999999-", Wanted::Outside),
-            ("bytes=-0", Wanted::Outside),
-            ("bytes=5-2", Wanted::Whole),
-            ("bytes=0-1,4-5", Wanted::Whole),
-            ("bytes=+1-2", Wanted::Whole),
-            ("bytes=a-b", Wanted::Whole),
-            ("bytes=-", Wanted::Whole),
-            ("lines=1-2", Wanted::Whole),
+            ("bytes=10-", RequestedRange::Outside),
+            ("bytes=10-12", RequestedRange::Outside),
+            ("bytes=99999999999999999999999-", RequestedRange::Outside),
+            ("bytes=-0", RequestedRange::Outside),
+            ("bytes=5-2", RequestedRange::Whole),
+            ("bytes=0-1,4-5", RequestedRange::Whole),
+            ("bytes=+1-2", RequestedRange::Whole),
+            ("bytes=a-b", RequestedRange::Whole),
+            ("bytes=-", RequestedRange::Whole),
+            ("lines=1-2", RequestedRange::Whole),
         ] {
-            assert_eq!(wanted(&headers(&[("range", range)]), "\"t\"", 10), expected, "{range}");
+            assert_eq!(
+                requested_range(&headers(&[("range", range)]), "\"t\"", 10),
+                expected,
+                "{range}"
+            );
         }
     }
 
     #[test]
-    fn a_range_of_an_older_content_is_not_taken() {
-        let with =
-            |tag| wanted(&headers(&[("range", "bytes=0-1"), ("if-range", tag)]), "\"t\"", 10);
-        assert_eq!(with("\"t\""), Wanted::Part { start: 0, length: 2 });
-        assert_eq!(with("\"old\""), Wanted::Whole);
-        assert_eq!(with("W/\"t\""), Wanted::Whole, "weak tags do not serve for ranges");
+    fn a_range_of_older_content_gets_the_whole_file() {
+        let with = |tag| {
+            requested_range(&headers(&[("range", "bytes=0-1"), ("if-range", tag)]), "\"t\"", 10)
+        };
+        assert_eq!(with("\"t\""), RequestedRange::Part { start: 0, length: 2 });
+        assert_eq!(with("\"old\""), RequestedRange::Whole);
+        assert_eq!(with("W/\"t\""), RequestedRange::Whole, "If-Range compares tags strongly");
     }
 
     #[test]
-    fn a_head_has_no_ranges() {
+    fn a_head_request_ignores_ranges() {
         let part = headers(&[("range", "bytes=0-1")]);
-        assert_eq!(super::wanted(&Method::HEAD, &part, "\"t\"", 10), Wanted::Whole);
+        assert_eq!(
+            super::requested_range(&Method::HEAD, &part, "\"t\"", 10),
+            RequestedRange::Whole
+        );
     }
 
     #[test]
-    fn another_state_than_the_one_that_is_meant_is_refused() {
+    fn a_request_for_another_state_is_rejected() {
         for list in ["\"t\"", "\"a\", \"t\"", "*"] {
             assert!(check_match(&headers(&[("if-match", list)]), "\"t\"").is_ok(), "{list}");
         }

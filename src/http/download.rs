@@ -1,4 +1,4 @@
-//! A file as an answer, whole or in part, with ETag and Range.
+//! Sends a file or a range of it, with ETag and Range.
 
 use axum::body::Body;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
@@ -7,37 +7,38 @@ use tokio::fs::File;
 use tokio::io::{AsyncReadExt, AsyncSeekExt, SeekFrom, Take};
 use tokio_util::io::ReaderStream;
 
-use super::conditional::{self, Wanted};
+use super::conditional::{self, RequestedRange};
 use super::error::{ApiError, Code, Result};
 use engine::job::Sha256;
 use store::StoreError;
 
-/// What is told of a file.
+/// A file as the headers of an answer describe it.
 #[derive(Debug)]
 pub(super) struct Download {
     pub(super) sha256: Sha256,
     pub(super) size: u64,
     /// The media type.
     pub(super) kind: &'static str,
-    /// Whether a browser shows or saves it, and under which name.
+    /// `Content-Disposition`: `inline` or `attachment`, and the file name.
     pub(super) disposition: String,
-    /// Whether ranges of it may be asked for.
-    pub(super) in_parts: bool,
+    /// True if the service answers range requests.
+    pub(super) accepts_ranges: bool,
 }
 
 impl Download {
-    /// The file that `open` gives, the part of it that is asked for, or word that the client has it.
+    /// Answers with the file that `open` opens, the requested range of it, or 304 if the client has it.
     pub(super) async fn send(
         &self,
         open: impl Future<Output = Result<std::fs::File, StoreError>>,
         request: (&Method, &HeaderMap),
     ) -> Result<Response> {
-        let read =
-            async |start, length| part(open.await?, start, length).await.map(Body::from_stream);
+        let read = async |start, length| {
+            stream_range(open.await?, start, length).await.map(Body::from_stream)
+        };
         self.answer(read, request).await
     }
 
-    /// The same with a body that is made for its first byte and its length.
+    /// Like [`Self::send`]. `read` makes the body, given the first byte and the length of the requested range.
     pub(super) async fn answer(
         &self,
         read: impl AsyncFnOnce(u64, u64) -> Result<Body>,
@@ -53,7 +54,7 @@ impl Download {
         let fields = response.headers_mut();
         fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(self.kind));
         fields.insert(header::CONTENT_LENGTH, length.into());
-        let ranges = if self.in_parts { "bytes" } else { "none" };
+        let ranges = if self.accepts_ranges { "bytes" } else { "none" };
         fields.insert(header::ACCEPT_RANGES, HeaderValue::from_static(ranges));
         fields.insert(header::ETAG, value(etag));
         fields.insert(header::CONTENT_DISPOSITION, value(self.disposition.clone()));
@@ -64,32 +65,34 @@ impl Download {
         Ok(response)
     }
 
-    /// Status, first byte and length of what is asked for.
+    /// Status of the answer, and first byte and length of the requested range.
     fn portion(
         &self,
         etag: &str,
         (method, headers): (&Method, &HeaderMap),
     ) -> Result<(StatusCode, u64, u64)> {
         let whole = (StatusCode::OK, 0, self.size);
-        if !self.in_parts {
+        if !self.accepts_ranges {
             return Ok(whole);
         }
-        match conditional::wanted(method, headers, etag, self.size) {
-            Wanted::Whole => Ok(whole),
-            Wanted::Part { start, length } => Ok((StatusCode::PARTIAL_CONTENT, start, length)),
-            Wanted::Outside => Err(outside(self.size)),
+        match conditional::requested_range(method, headers, etag, self.size) {
+            RequestedRange::Whole => Ok(whole),
+            RequestedRange::Part { start, length } => {
+                Ok((StatusCode::PARTIAL_CONTENT, start, length))
+            }
+            RequestedRange::Outside => Err(range_error(self.size)),
         }
     }
 }
 
-fn outside(size: u64) -> ApiError {
-    let detail = format!("the file has {size} bytes, counted from 0");
+fn range_error(size: u64) -> ApiError {
+    let detail = format!("the range begins after the end of the file, which has {size} bytes");
     ApiError::new(Code::RangeNotSatisfiable, detail)
         .with_header(header::CONTENT_RANGE, value(format!("bytes */{size}")))
 }
 
-/// The bytes of a file from `start` on.
-pub(super) async fn part(
+/// Reads `length` bytes of a file from `start` on.
+pub(super) async fn stream_range(
     file: std::fs::File,
     start: u64,
     length: u64,

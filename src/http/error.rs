@@ -1,4 +1,4 @@
-//! Errors as the user sees them: problem+json (RFC 9457).
+//! Error answers: problem details (RFC 9457).
 
 use std::sync::LazyLock;
 
@@ -13,12 +13,12 @@ use engine::job::InvalidField;
 use formats::{DiskTrouble, FormatError};
 use store::StoreError;
 
-/// tus 1.0 has a status of its own for this.
+/// The status that tus 1.0 defines for a wrong checksum.
 static CHECKSUM_STATUS: LazyLock<StatusCode> =
     LazyLock::new(|| StatusCode::from_u16(460).unwrap_or(StatusCode::BAD_REQUEST));
 
-/// What can be wrong, from a table of the status, the title, and whether the same request may succeed
-/// later. The name, which is the variant's in snake case, never changes, for programs to rely on.
+/// Defines the codes of errors from a table: status, title, and whether a retry may succeed. The name of a code is the
+/// variant in snake case. Programs rely on it, so it never changes.
 macro_rules! codes {
     ($($code:ident: $status:expr, $title:literal, $retryable:literal;)*) => {
         #[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr, VariantArray)]
@@ -28,7 +28,7 @@ macro_rules! codes {
         }
 
         impl Code {
-            /// Its status, its title, and whether the same request may succeed later.
+            /// The status, the title, and whether the same request may succeed later.
             pub(super) fn row(self) -> (StatusCode, &'static str, bool) {
                 match self {
                     $(Self::$code => ($status, $title, $retryable),)*
@@ -39,51 +39,51 @@ macro_rules! codes {
 }
 
 codes! {
-    MalformedJson: StatusCode::BAD_REQUEST, "The body is not JSON", false;
-    MalformedRequest: StatusCode::BAD_REQUEST, "The request can't be read", false;
-    InvalidQuery: StatusCode::BAD_REQUEST, "A query parameter is wrong", false;
-    EmptyBody: StatusCode::BAD_REQUEST, "The body is empty", false;
-    Unauthorized: StatusCode::UNAUTHORIZED, "Who is there?", false;
-    Forbidden: StatusCode::FORBIDDEN, "The token does not allow it", false;
-    ForeignSite: StatusCode::FORBIDDEN, "Not for a page of another site", false;
-    NotFound: StatusCode::NOT_FOUND, "There is no such thing", false;
-    NotReady: StatusCode::NOT_FOUND, "It is not there yet", true;
-    CalibrationNotReady: StatusCode::CONFLICT, "The masks are not there", true;
-    MeasurementNotReady: StatusCode::CONFLICT, "The measurement is not checked", true;
-    MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Not with this method", false;
-    UploadStalled: StatusCode::REQUEST_TIMEOUT, "The upload came to a halt", true;
-    OffsetMismatch: StatusCode::CONFLICT, "The piece does not follow", false;
-    TusVersion: StatusCode::PRECONDITION_FAILED, "Not in this version of tus", false;
-    PreconditionFailed: StatusCode::PRECONDITION_FAILED, "It is in another state", false;
-    UploadBusy: StatusCode::LOCKED, "Another request is at it", true;
+    MalformedJson: StatusCode::BAD_REQUEST, "Body is not valid JSON", false;
+    MalformedRequest: StatusCode::BAD_REQUEST, "Request can't be parsed", false;
+    InvalidQuery: StatusCode::BAD_REQUEST, "Invalid query parameter", false;
+    EmptyBody: StatusCode::BAD_REQUEST, "Body is empty", false;
+    Unauthorized: StatusCode::UNAUTHORIZED, "Authentication required", false;
+    Forbidden: StatusCode::FORBIDDEN, "Role of the token is too low", false;
+    ForeignSite: StatusCode::FORBIDDEN, "Request from another site", false;
+    NotFound: StatusCode::NOT_FOUND, "Not found", false;
+    NotReady: StatusCode::NOT_FOUND, "Not ready yet", true;
+    CalibrationNotReady: StatusCode::CONFLICT, "Calibration is not ready", true;
+    MeasurementNotReady: StatusCode::CONFLICT, "Measurement is not ready", true;
+    MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Method not allowed", false;
+    UploadStalled: StatusCode::REQUEST_TIMEOUT, "Upload stalled", true;
+    OffsetMismatch: StatusCode::CONFLICT, "Offset does not match the bytes received so far", false;
+    TusVersion: StatusCode::PRECONDITION_FAILED, "Unsupported version of tus", false;
+    PreconditionFailed: StatusCode::PRECONDITION_FAILED, "Resource has changed", false;
+    UploadBusy: StatusCode::LOCKED, "Upload is locked by another request", true;
     UploadDamaged: StatusCode::GONE, "Bytes of the upload are lost", false;
-    ChecksumMismatch: *CHECKSUM_STATUS, "The piece has come damaged", true;
-    InUse: StatusCode::CONFLICT, "Something else needs it", false;
-    IllegalState: StatusCode::CONFLICT, "Not in this state", false;
-    TooLarge: StatusCode::PAYLOAD_TOO_LARGE, "The body is too large", false;
-    UnsupportedMediaType: StatusCode::UNSUPPORTED_MEDIA_TYPE, "Not in this media type", false;
-    RangeNotSatisfiable: StatusCode::RANGE_NOT_SATISFIABLE, "The range is outside", false;
-    InvalidRequest: StatusCode::UNPROCESSABLE_ENTITY, "The request does not fit", false;
-    InvalidContent: StatusCode::UNPROCESSABLE_ENTITY, "The file does not fit", false;
-    SizeMismatch: StatusCode::UNPROCESSABLE_ENTITY, "The sizes do not fit", false;
-    HashMismatch: StatusCode::UNPROCESSABLE_ENTITY, "The bytes are not those named", true;
-    IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "The key was used for another request", false;
-    TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads at once", true;
-    TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many requests wait", true;
-    TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Enough files wait to be checked", true;
+    ChecksumMismatch: *CHECKSUM_STATUS, "Checksum does not match", true;
+    InUse: StatusCode::CONFLICT, "Resource is in use", false;
+    IllegalState: StatusCode::CONFLICT, "Not possible in this state", false;
+    TooLarge: StatusCode::PAYLOAD_TOO_LARGE, "Body is too large", false;
+    UnsupportedMediaType: StatusCode::UNSUPPORTED_MEDIA_TYPE, "Unsupported media type", false;
+    RangeNotSatisfiable: StatusCode::RANGE_NOT_SATISFIABLE, "Range is outside the file", false;
+    InvalidRequest: StatusCode::UNPROCESSABLE_ENTITY, "Invalid request", false;
+    InvalidContent: StatusCode::UNPROCESSABLE_ENTITY, "Invalid file", false;
+    SizeMismatch: StatusCode::UNPROCESSABLE_ENTITY, "Sizes do not match", false;
+    HashMismatch: StatusCode::UNPROCESSABLE_ENTITY, "Hash does not match", true;
+    IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "Idempotency key belongs to another request", false;
+    TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads", true;
+    TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many waiting requests", true;
+    TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Too many files wait for a check", true;
     RateLimited: StatusCode::TOO_MANY_REQUESTS, "Too many requests", true;
-    QueueFull: StatusCode::TOO_MANY_REQUESTS, "Enough jobs wait", true;
-    Internal: StatusCode::INTERNAL_SERVER_ERROR, "The service has failed", true;
-    TaskFailed: StatusCode::INTERNAL_SERVER_ERROR, "A task has failed", true;
-    OutOfMemory: StatusCode::INTERNAL_SERVER_ERROR, "A worker ran out of memory", true;
-    WorkerCrashed: StatusCode::INTERNAL_SERVER_ERROR, "A worker crashed", true;
+    QueueFull: StatusCode::TOO_MANY_REQUESTS, "Job queue is full", true;
+    Internal: StatusCode::INTERNAL_SERVER_ERROR, "Internal error", true;
+    TaskFailed: StatusCode::INTERNAL_SERVER_ERROR, "Task failed", true;
+    OutOfMemory: StatusCode::INTERNAL_SERVER_ERROR, "Worker ran out of memory", true;
+    WorkerCrashed: StatusCode::INTERNAL_SERVER_ERROR, "Worker crashed", true;
     WorkerLost: StatusCode::INTERNAL_SERVER_ERROR, "Workers stopped too often", true;
     MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "Movie can't be encoded", false;
-    FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "The stored file is damaged", false;
-    Unavailable: StatusCode::SERVICE_UNAVAILABLE, "The service can't serve this now", true;
-    TimedOut: StatusCode::SERVICE_UNAVAILABLE, "The answer took too long", true;
-    InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "The disk is full", true;
-    QuotaExceeded: StatusCode::FORBIDDEN, "A limit is reached", false;
+    FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "Stored file is damaged", false;
+    Unavailable: StatusCode::SERVICE_UNAVAILABLE, "Service is unavailable", true;
+    TimedOut: StatusCode::SERVICE_UNAVAILABLE, "Request timed out", true;
+    InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "Disk is full", true;
+    QuotaExceeded: StatusCode::FORBIDDEN, "Quota is exceeded", false;
 }
 
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
@@ -93,19 +93,19 @@ tokio::task_local! {
     pub(super) static REQUEST_ID: String;
 }
 
-/// An error on its way to the user.
+/// An error that becomes the answer to a request.
 #[derive(Debug)]
 pub struct ApiError {
     code: Code,
-    /// False where another request of the same code may succeed later, and this one can't.
-    has_hope: bool,
+    /// False if this request can never succeed, although others with the same code may succeed later.
+    may_succeed_later: bool,
     detail: String,
     errors: Vec<InvalidField>,
     reason: Option<String>,
     headers: Vec<(HeaderName, HeaderValue)>,
 }
 
-/// Names of all codes.
+/// The names of all codes.
 fn codes() -> Vec<&'static str> {
     Code::VARIANTS.iter().map(|code| code.into_str()).collect()
 }
@@ -140,24 +140,24 @@ pub struct Problem {
 }
 
 impl ApiError {
-    /// An error with what is wrong, where, and what would be right.
+    /// An error with a detail: the fault, its place, and what to do.
     pub fn new(code: Code, detail: impl Into<String>) -> Self {
         let (detail, errors, headers) = (detail.into(), Vec::new(), Vec::new());
-        Self { code, has_hope: true, detail, errors, reason: None, headers }
+        Self { code, may_succeed_later: true, detail, errors, reason: None, headers }
     }
 
-    /// A request with fields that are wrong.
+    /// Errors in several fields of a request.
     pub fn fields(code: Code, errors: Vec<InvalidField>) -> Self {
         let texts: Vec<&str> = errors.iter().map(|error| error.detail.as_str()).collect();
         Self { errors: errors.clone(), ..Self::new(code, texts.join("; ")) }
     }
 
-    /// A request with one field that is wrong.
+    /// An error in one field of a request.
     pub fn field(pointer: &str, detail: impl Into<String>) -> Self {
         Self::fields(Code::InvalidRequest, vec![InvalidField::new(pointer, detail)])
     }
 
-    /// What a request names and is not there is an error of the request.
+    /// An error of a reference in a request. If the resource does not exist, the field is invalid (422, not 404).
     pub fn reference(pointer: &str, error: StoreError) -> Self {
         match error {
             StoreError::NotFound { .. } => Self::field(pointer, error.to_string()),
@@ -165,13 +165,13 @@ impl ApiError {
         }
     }
 
-    /// The same error with the place in the request.
+    /// Adds the JSON pointer to the field of the request.
     pub fn at(mut self, pointer: &str) -> Self {
         self.errors = vec![InvalidField::new(pointer, self.detail.clone())];
         self
     }
 
-    /// The same error with a header in the answer.
+    /// Adds a header to the answer.
     pub fn with_header(mut self, name: HeaderName, value: HeaderValue) -> Self {
         self.headers.push((name, value));
         self
@@ -187,7 +187,7 @@ impl ApiError {
             status: status.as_u16(),
             detail: self.detail.clone(),
             code,
-            retryable: retryable && self.has_hope,
+            retryable: retryable && self.may_succeed_later,
             instance: REQUEST_ID.try_with(|id| format!("urn:sci-recon:request:{id}")).ok(),
             reason: self.reason.clone(),
             pointer: self.errors.first().map(|error| error.pointer.clone()),
@@ -199,22 +199,25 @@ impl ApiError {
         self.code
     }
 
-    /// The reason of a job, which belongs to no request.
+    /// The problem of a failed job. It does not name the current request.
     pub(super) fn problem_of_job(&self) -> Problem {
         Problem { instance: None, ..self.problem() }
     }
 
-    /// An error of ours: the log gets the cause, the user does not.
+    /// An internal error. The cause is logged and not sent to the client.
     pub fn internal(cause: &(dyn std::error::Error + 'static)) -> Self {
         tracing::error!(error = cause, "a request failed");
-        Self::new(Code::Internal, "an error of the service; its log says more")
+        Self::new(
+            Code::Internal,
+            "the service failed; its log has the cause under the identifier of this request",
+        )
     }
 }
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
         let (status, _, retryable) = self.code.row();
-        let retryable = retryable && self.has_hope;
+        let retryable = retryable && self.may_succeed_later;
         let mut response = (status, Json(self.problem())).into_response();
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
@@ -233,7 +236,7 @@ impl IntoResponse for ApiError {
 }
 
 fn disk_error(trouble: DiskTrouble, cause: &(dyn std::error::Error + 'static)) -> ApiError {
-    tracing::error!(error = cause, ?trouble, "the disk takes no files");
+    tracing::error!(error = cause, ?trouble, "no file can be written to the disk");
     Refusal::disk_trouble(trouble).into()
 }
 
@@ -265,7 +268,7 @@ impl From<StoreError> for ApiError {
             StoreError::Interrupted | StoreError::Restless(_) => Code::Unavailable,
             busy if busy.is_busy() => {
                 tracing::warn!(%error, "the database is busy");
-                let detail = "the database is busy; nothing was changed: try again";
+                let detail = "the database is busy and nothing was changed; try again";
                 return Self::new(Code::Unavailable, detail);
             }
             StoreError::Database(_)
@@ -278,13 +281,13 @@ impl From<StoreError> for ApiError {
             | StoreError::Refused { .. }
             | StoreError::Corrupt { .. } => return Self::internal(&error),
         };
-        // What has failed will never be ready.
-        let has_hope = !matches!(
+        // A failed calibration or measurement never becomes ready.
+        let may_succeed_later = !matches!(
             error,
             StoreError::Unready { error: Some(_), .. }
                 | StoreError::Unchecked { error: Some(_), .. }
         );
-        Self { has_hope, ..Self::new(code, error.to_string()) }
+        Self { may_succeed_later, ..Self::new(code, error.to_string()) }
     }
 }
 
@@ -334,7 +337,7 @@ mod tests {
 
     use super::Code;
 
-    /// Codes that a text names in backticks.
+    /// The codes that a text names in backticks.
     fn named(text: &str) -> impl Iterator<Item = &str> {
         text.split('`').skip(1).step_by(2).filter(|word| word.parse::<Code>().is_ok())
     }
@@ -349,7 +352,7 @@ mod tests {
             listed.iter().map(|code| code.as_str().unwrap()).collect::<BTreeSet<_>>(),
             codes.collect()
         );
-        // What each answer of each operation names, under its status.
+        // The codes that the answers of all operations name, with their status.
         let mut documented = BTreeSet::new();
         for path in contract["paths"].as_object().unwrap().values() {
             for operation in path.as_object().unwrap().values() {
@@ -362,11 +365,11 @@ mod tests {
                 }
             }
         }
-        // Reasons of jobs are no answers.
+        // Codes of failed jobs are not answers to requests.
         let reasons = &contract["components"]["schemas"]["JobProblem"]["description"];
         let reasons = named(reasons.as_str().unwrap());
         documented.extend(reasons.map(|code| ("500".to_owned(), code)));
-        // No operation has the status for a method that a path does not take.
+        // The operations do not list 405; the introduction describes it.
         let about = contract["info"]["description"].as_str().unwrap();
         assert!(about.contains("405 (`method_not_allowed`)"));
         documented.insert(("405".into(), "method_not_allowed"));

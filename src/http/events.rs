@@ -1,7 +1,7 @@
-//! `/v1/events`: says which jobs, calibrations and measurements have changed, for those who would poll otherwise.
+//! `/v1/events`: reports changes of jobs, calibrations and measurements, so that clients do not have to poll.
 //!
-//! Workers are other processes, so the server reads the changes that triggers note in the database: when it is
-//! written, and once a second.
+//! Workers are other processes. Triggers of the database record each change, and the server reads these records when the
+//! database is written to, and at least once a second.
 
 use std::collections::{HashMap, VecDeque};
 use std::convert::Infallible;
@@ -24,18 +24,18 @@ use super::shares::{Place, Places};
 use engine::job::{JobId, Lab, ThingId};
 use store::{Changes, Made, Store, StoreError};
 
-/// The longest time between two looks at the changes.
-const LOOK: Duration = Duration::from_secs(1);
-/// The shortest. Where looking takes long, a fifth of the time is spent on it at most.
-const SPACING: Duration = Duration::from_millis(40);
-/// Listeners at the same time: each holds a connection.
+/// Longest time between two reads of the changes.
+const MAX_INTERVAL: Duration = Duration::from_secs(1);
+/// Shortest pause between two reads. After a slow read the pause is longer, so that reading takes at most a fifth of the time.
+const MIN_PAUSE: Duration = Duration::from_millis(40);
+/// Largest number of concurrent listeners. Each holds a connection.
 const LISTENERS: usize = 128;
-/// The most jobs that an event names; beyond that a list is cheaper to read again.
-const NAMED: usize = 200;
+/// Largest number of identifiers in an event. With more changes, reading the list again is cheaper.
+const MAX_NAMED: usize = 200;
 
-/// Requests of one lab that wait for the end of something at the same time: each holds a connection.
+/// Largest number of concurrent requests of a lab that wait for a result. Each holds a connection.
 const WAITERS: usize = 64;
-/// What an event says that does not name all jobs.
+/// Part of the data of an event that does not name all changes.
 const MORE: &str = "\"more\":true";
 
 /// The data of an event.
@@ -47,30 +47,30 @@ pub(super) struct Change {
     more: bool,
 }
 
-/// What each lab is told.
+/// The data of the events of each lab, as JSON.
 #[derive(Debug, Default)]
-struct Told {
+struct LabEvents {
     jobs: HashMap<Lab, String>,
     calibrations: HashMap<Lab, String>,
     measurements: HashMap<Lab, String>,
-    /// For requests that wait for the check of a model.
+    /// Listeners do not get these; requests wait for the check of a model with them.
     models: HashMap<Lab, String>,
 }
 
-/// Which of what labs are told.
-type Kind = fn(&Told) -> &HashMap<Lab, String>;
+/// Selects the events of one kind of resource.
+type Kind = fn(&LabEvents) -> &HashMap<Lab, String>;
 
 fn kind(what: Made) -> Kind {
     match what {
-        Made::Job => |told| &told.jobs,
-        Made::Calibration => |told| &told.calibrations,
-        Made::Measurement => |told| &told.measurements,
-        Made::Model | Made::Upload => |told| &told.models,
+        Made::Job => |events| &events.jobs,
+        Made::Calibration => |events| &events.calibrations,
+        Made::Measurement => |events| &events.measurements,
+        Made::Model | Made::Upload => |events| &events.models,
     }
 }
 
 /// The events of all labs, with the number of the last change in them.
-type Message = (i64, Arc<Told>);
+type Message = (i64, Arc<LabEvents>);
 
 /// The stream of changes to which listeners subscribe.
 #[derive(Debug, Clone)]
@@ -85,18 +85,16 @@ pub(super) struct Events {
 }
 
 impl Events {
-    /// Begins to look, until `closing`.
+    /// Starts to watch the changes, until `closing` is cancelled.
     pub(super) fn start(store: Store, closing: CancellationToken) -> Self {
         let (sender, _) = broadcast::channel(16);
         let last = Arc::default();
-        let looking = look(store.clone(), sender.clone(), Arc::clone(&last));
-        tokio::spawn(closing.clone().run_until_cancelled_owned(looking));
+        let watching = watch(store.clone(), sender.clone(), Arc::clone(&last));
+        tokio::spawn(closing.clone().run_until_cancelled_owned(watching));
         let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
         Self { sender, last, store, places, waiters, closing }
     }
-}
 
-impl Events {
     /// Waits until a job of the lab has ended.
     pub(super) async fn ended(
         &self,
@@ -106,10 +104,10 @@ impl Events {
         time: Duration,
     ) -> Result<()> {
         let ended = || async { Ok(store.job_state(lab, job).await?.is_final()) };
-        self.until(lab, time, (|told| &told.jobs, job.to_string()), ended).await
+        self.until(lab, time, (kind(Made::Job), job.to_string()), ended).await
     }
 
-    /// Waits until a calibration, measurement or model is there, or was refused.
+    /// Waits until a calibration, measurement or model is ready or rejected.
     pub(super) async fn settled(
         &self,
         store: &Store,
@@ -133,8 +131,8 @@ impl Events {
         self.until(lab, time, (kind(what), id.to_string()), checked).await
     }
 
-    /// Waits until something of this kind and name is `settled`, at most for `time` and until the service stops. No
-    /// connection to the database is held meanwhile: the looks that listeners need serve all who wait.
+    /// Waits until `settled` is true of the resource with this name. Returns after `time` or when the service stops, too.
+    /// Checks `settled` again only after a change, so that a waiting request holds no connection to the database.
     async fn until<F: Future<Output = Result<bool>>>(
         &self,
         lab: &Lab,
@@ -143,7 +141,7 @@ impl Events {
         settled: impl Fn() -> F,
     ) -> Result<()> {
         let _place = self.waiters.take(lab)?;
-        // Before the first look at it, so that no change falls between them.
+        // Subscribes before the first check, so that no change is missed in between.
         let mut receiver = self.sender.subscribe();
         let ended = async {
             while !settled().await? {
@@ -171,23 +169,25 @@ impl Events {
     }
 }
 
-/// How many requests of each lab wait for the end of something.
+/// Number of waiting requests of each lab.
 #[derive(Debug, Clone, Default)]
 struct Waiters(Arc<Mutex<HashMap<Lab, usize>>>);
 
-/// The place of a request that waits, until it is dropped.
+/// A waiting request. It is counted until this is dropped.
 #[derive(Debug)]
 struct Waiter(Waiters, Lab);
 
 impl Waiters {
     fn take(&self, lab: &Lab) -> Result<Waiter> {
         let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let own = waiting.entry(lab.clone()).or_default();
-        if *own >= WAITERS {
-            let detail = format!("{WAITERS} requests of this lab wait; ask without wait");
+        let count = waiting.entry(lab.clone()).or_default();
+        if *count >= WAITERS {
+            let detail = format!(
+                "{WAITERS} requests of this lab are waiting already; send the request without wait"
+            );
             return Err(ApiError::new(Code::TooManyWaiters, detail));
         }
-        *own += 1;
+        *count += 1;
         Ok(Waiter(self.clone(), lab.clone()))
     }
 }
@@ -195,59 +195,59 @@ impl Waiters {
 impl Drop for Waiter {
     fn drop(&mut self) {
         let mut waiting = self.0.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(own) = waiting.get_mut(&self.1) {
-            *own -= 1;
-            if *own == 0 {
+        if let Some(count) = waiting.get_mut(&self.1) {
+            *count -= 1;
+            if *count == 0 {
                 waiting.remove(&self.1);
             }
         }
     }
 }
 
-/// Sends the changes; `last` is the number of the last one that needs no event.
-async fn look(store: Store, sender: broadcast::Sender<Message>, last: Arc<AtomicI64>) {
+/// Sends events of changes. `last` is the number of the last change that listeners have.
+async fn watch(store: Store, sender: broadcast::Sender<Message>, last: Arc<AtomicI64>) {
     let mut watcher = store.watcher().ok();
     loop {
         let change = async {
             match &mut watcher {
-                Some(watcher) => watcher.changed(LOOK).await.is_ok(),
+                Some(watcher) => watcher.changed(MAX_INTERVAL).await.is_ok(),
                 None => false,
             }
         };
         if !change.await {
             watcher = store.watcher().ok();
-            tokio::time::sleep(LOOK).await;
+            tokio::time::sleep(MAX_INTERVAL).await;
         }
         let start = Instant::now();
-        match next(&store, &sender, last.load(Ordering::Relaxed)).await {
-            Ok(seen) => last.store(seen, Ordering::Relaxed),
-            // A failing database shows in every other answer, too.
+        match send_changes(&store, &sender, last.load(Ordering::Relaxed)).await {
+            Ok(number) => last.store(number, Ordering::Relaxed),
+            // Other requests report a failing database.
             Err(error) => tracing::debug!(%error, "the changes can't be read"),
         }
-        tokio::time::sleep(SPACING.max(4 * start.elapsed())).await;
+        tokio::time::sleep(MIN_PAUSE.max(4 * start.elapsed())).await;
     }
 }
 
-/// Sends the changes after the one with the number `last`; returns the number of the last change that it has seen.
-async fn next(
+/// Sends events of the changes after number `last`, and returns the number of the last change.
+async fn send_changes(
     store: &Store,
     sender: &broadcast::Sender<Message>,
     last: i64,
 ) -> Result<i64, StoreError> {
-    // In this order: a listener that subscribes after the second line has read lists with these changes.
-    let seen = store.last_change().await?;
-    if seen == last || sender.receiver_count() == 0 {
-        return Ok(seen);
+    // The order matters: a client that subscribes after the count of receivers reads lists that include these changes.
+    let newest = store.last_change().await?;
+    if newest == last || sender.receiver_count() == 0 {
+        return Ok(newest);
     }
     let changes = store.changes(last).await?;
-    let seen = changes.last;
-    // Fails only if the last listener has just left.
-    let _ = sender.send((seen, message(store, changes).await?.into()));
-    Ok(seen)
+    let newest = changes.last;
+    // Fails only if the last listener has just disconnected.
+    let _ = sender.send((newest, lab_events(store, changes).await?.into()));
+    Ok(newest)
 }
 
-/// The events of all labs.
-async fn message(store: &Store, changes: Changes) -> Result<Told, StoreError> {
+/// The events of all labs for these changes.
+async fn lab_events(store: &Store, changes: Changes) -> Result<LabEvents, StoreError> {
     let mut by_kind: [HashMap<Lab, Change>; 4] = Default::default();
     let Some(items) = changes.items else {
         for lab in store.lab_names().await? {
@@ -255,7 +255,7 @@ async fn message(store: &Store, changes: Changes) -> Result<Told, StoreError> {
                 labs.entry(lab.clone()).or_default().more = true;
             }
         }
-        return Ok(texts(by_kind));
+        return Ok(to_json(by_kind));
     };
     for item in items {
         let kind = match item.what.as_str() {
@@ -267,25 +267,27 @@ async fn message(store: &Store, changes: Changes) -> Result<Told, StoreError> {
         let change = by_kind[kind].entry(item.lab).or_default();
         if item.exists { &mut change.changed } else { &mut change.deleted }.push(item.id);
     }
-    Ok(texts(by_kind))
+    Ok(to_json(by_kind))
 }
 
-fn texts(by_kind: [HashMap<Lab, Change>; 4]) -> Told {
+/// Serializes the changes of each kind.
+fn to_json(by_kind: [HashMap<Lab, Change>; 4]) -> LabEvents {
     let [jobs, calibrations, measurements, models] = by_kind.map(|labs| {
-        let text =
-            |(lab, change): (Lab, Change)| Some((lab, serde_json::to_string(&change.cut()).ok()?));
+        let text = |(lab, change): (Lab, Change)| {
+            Some((lab, serde_json::to_string(&change.limited()).ok()?))
+        };
         labs.into_iter().filter_map(text).collect()
     });
-    Told { jobs, calibrations, measurements, models }
+    LabEvents { jobs, calibrations, measurements, models }
 }
 
 impl Change {
-    /// Newest first, and no more than are named.
-    fn cut(mut self) -> Self {
-        self.more |= self.changed.len() > NAMED || self.deleted.len() > NAMED;
+    /// Sorts the identifiers, newest first, and limits their number.
+    fn limited(mut self) -> Self {
+        self.more |= self.changed.len() > MAX_NAMED || self.deleted.len() > MAX_NAMED;
         for list in [&mut self.changed, &mut self.deleted] {
             list.sort_unstable_by(|a, b| b.cmp(a));
-            list.truncate(NAMED);
+            list.truncate(MAX_NAMED);
         }
         self
     }
@@ -297,23 +299,23 @@ pub(super) async fn listen(
     headers: HeaderMap,
 ) -> Result<Response> {
     let place = events.places.take(&access.lab).ok_or_else(|| {
-        let detail = "all places for listeners are taken, or this lab has its share; poll instead";
+        let detail = "the service or this lab has too many listeners; poll the lists instead";
         ApiError::new(Code::Unavailable, detail)
     })?;
     let mut listener = Listener {
         lab: access.lab,
-        // Before the changes are read, so that none falls between them.
+        // Subscribes before the changes are read, so that none is missed in between.
         receiver: events.sender.subscribe(),
         last: Arc::clone(&events.last),
-        seen: events.last.load(Ordering::Relaxed),
+        last_sent: events.last.load(Ordering::Relaxed),
         closing: events.closing.clone(),
         waiting: VecDeque::new(),
         _place: place,
     };
-    let seen = headers.get("last-event-id").and_then(|id| id.to_str().ok()?.parse().ok());
-    listener.start(&events.store, seen).await?;
+    let last_received = headers.get("last-event-id").and_then(|id| id.to_str().ok()?.parse().ok());
+    listener.start(&events.store, last_received).await?;
     let events = stream::unfold(listener, Listener::next);
-    // Proxies must not gather events into larger packets.
+    // Keeps nginx from buffering the events.
     let unbuffered: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
     Ok(([unbuffered], Sse::new(events).keep_alive(KeepAlive::default())).into_response())
 }
@@ -322,8 +324,8 @@ struct Listener {
     lab: Lab,
     receiver: broadcast::Receiver<Message>,
     last: Arc<AtomicI64>,
-    /// Number of the last change that the listener knows.
-    seen: i64,
+    /// Number of the last change that is sent or queued.
+    last_sent: i64,
     closing: CancellationToken,
     /// Events to send next.
     waiting: VecDeque<Event>,
@@ -331,18 +333,18 @@ struct Listener {
 }
 
 impl Listener {
-    /// Queues the changes after the one with the number `seen`, or the greeting if they are not known any longer.
-    async fn start(&mut self, store: &Store, seen: Option<i64>) -> Result<()> {
-        if let Some(seen) = seen {
-            let changes = store.changes(seen).await?;
+    /// Queues the changes after number `last_received`, or a greeting if the database no longer has all of them.
+    async fn start(&mut self, store: &Store, last_received: Option<i64>) -> Result<()> {
+        if let Some(last_received) = last_received {
+            let changes = store.changes(last_received).await?;
             if changes.items.is_some() {
                 let last = changes.last;
-                let message = message(store, changes).await?;
-                self.queue(last, &message);
+                let events = lab_events(store, changes).await?;
+                self.queue(last, &events);
                 return Ok(());
             }
         }
-        self.waiting.push_back(hello(self.seen));
+        self.waiting.push_back(hello(self.last_sent));
         Ok(())
     }
 
@@ -356,27 +358,27 @@ impl Listener {
                 () = self.closing.cancelled() => return None,
             };
             match received {
-                Ok((number, changes)) if number > self.seen => self.queue(number, &changes),
+                Ok((number, events)) if number > self.last_sent => self.queue(number, &events),
                 Ok(_) => {}
-                // A slow listener has missed some changes: it must read the lists again.
+                // A slow listener has missed changes. The greeting makes it read the lists again.
                 Err(broadcast::error::RecvError::Lagged(_)) => {
                     self.receiver = self.receiver.resubscribe();
-                    self.seen = self.last.load(Ordering::Relaxed);
-                    self.waiting.push_back(hello(self.seen));
+                    self.last_sent = self.last.load(Ordering::Relaxed);
+                    self.waiting.push_back(hello(self.last_sent));
                 }
                 Err(broadcast::error::RecvError::Closed) => return None,
             }
         }
     }
 
-    /// Queues the events of the lab. The last one has the number: a connection that breaks between them gets all of
-    /// them again.
-    fn queue(&mut self, number: i64, changes: &Told) {
-        self.seen = number;
+    /// Queues the events of the lab. Only the last one has the number, so that a client that reconnects before it gets all
+    /// of them again.
+    fn queue(&mut self, number: i64, lab_events: &LabEvents) {
+        self.last_sent = number;
         let kinds = [
-            ("jobs", &changes.jobs),
-            ("calibrations", &changes.calibrations),
-            ("measurements", &changes.measurements),
+            ("jobs", &lab_events.jobs),
+            ("calibrations", &lab_events.calibrations),
+            ("measurements", &lab_events.measurements),
         ];
         let mut events: Vec<Event> = kinds
             .into_iter()
@@ -391,7 +393,7 @@ impl Listener {
     }
 }
 
-/// Has a listener read the lists, which are at least as new as the change with this number.
+/// The greeting, which makes a client read the lists. They include the changes up to this number.
 fn hello(number: i64) -> Event {
     Event::default().event("hello").data("{}").id(number.to_string())
 }

@@ -1,4 +1,4 @@
-//! Extractors whose refusals are problems.
+//! Extractors that reject requests with problem details, and parsers of request headers.
 
 use axum::body::Bytes;
 use axum::extract::rejection::{BytesRejection, PathRejection, QueryRejection};
@@ -17,7 +17,7 @@ use super::strict::Strict;
 use engine::job::{InvalidField, Sha256};
 use store::{Inserted, RequestKey};
 
-/// The service, and for whom a request to it is.
+/// The service, and the access that the request has.
 pub(super) struct Caller(pub(super) App, pub(super) Access);
 
 impl FromRequestParts<App> for Caller {
@@ -28,7 +28,7 @@ impl FromRequestParts<App> for Caller {
     }
 }
 
-/// The parameters in the path. What has not the form of an identifier names nothing: 404.
+/// The parameters of the path. A malformed identifier is answered with 404, like an unknown one.
 #[derive(Debug)]
 pub(super) struct Params<T>(pub(super) T);
 
@@ -50,7 +50,7 @@ where
     }
 }
 
-/// The query parameters. Unknown ones are refused if `T` says so.
+/// The query parameters. Unknown parameters are rejected if `T` denies unknown fields.
 #[derive(Debug)]
 pub(super) struct QueryOf<T>(pub(super) T);
 
@@ -72,6 +72,7 @@ where
     }
 }
 
+/// A JSON body.
 #[derive(Debug)]
 pub(super) struct Body<T>(pub(super) T);
 
@@ -88,32 +89,34 @@ where
             return Err(ApiError::new(Code::UnsupportedMediaType, detail));
         }
         check_encoding(request.headers())?;
-        let promised = content_digest(request.headers())?;
+        let expected = content_digest(request.headers())?;
         let bytes = Bytes::from_request(request, state).await.map_err(unreadable)?;
-        check_digest(promised, || Sha256::of(&bytes))?;
+        check_digest(expected, || Sha256::of(&bytes))?;
         if bytes.is_empty() {
-            return Err(ApiError::new(Code::EmptyBody, "a JSON object is needed as the body"));
+            return Err(ApiError::new(Code::EmptyBody, "the body is empty; send a JSON object"));
         }
         parse(&bytes).map(Self)
     }
 }
 
-/// Refuses a body that is compressed: its bytes would be stored, and hashed, as they are.
+/// Rejects a compressed body. The service would store and hash the compressed bytes.
 pub(super) fn check_encoding(headers: &HeaderMap) -> Result<()> {
-    let coded = headers.get_all(header::CONTENT_ENCODING).iter().find(|coding| {
+    let encoding = headers.get_all(header::CONTENT_ENCODING).iter().find(|coding| {
         !coding.to_str().is_ok_and(|coding| coding.trim().eq_ignore_ascii_case("identity"))
     });
-    let Some(coding) = coded else { return Ok(()) };
-    let detail = format!("send the body as it is: {coding:?} is not undone here");
+    let Some(encoding) = encoding else { return Ok(()) };
+    let detail = format!(
+        "Content-Encoding {encoding:?} is not supported: send the body without compression"
+    );
     let identity = HeaderValue::from_static("identity");
     Err(ApiError::new(Code::UnsupportedMediaType, detail)
         .with_header(header::ACCEPT_ENCODING, identity))
 }
 
-/// The SHA-256 that `Content-Digest` promises (RFC 9530); none if it names none. Other algorithms are ignored.
+/// The SHA-256 in `Content-Digest` (RFC 9530), if there is one. Other algorithms are ignored.
 pub(super) fn content_digest(headers: &HeaderMap) -> Result<Option<Sha256>> {
     let malformed = || {
-        let detail = "Content-Digest has sha-256, but not as :BASE64: of 32 bytes";
+        let detail = "sha-256 in Content-Digest must be 32 bytes in base64 between colons";
         ApiError::new(Code::MalformedRequest, detail)
     };
     for value in headers.get_all("content-digest") {
@@ -130,14 +133,16 @@ pub(super) fn content_digest(headers: &HeaderMap) -> Result<Option<Sha256>> {
     Ok(None)
 }
 
-/// Refuses a body whose bytes are not those that were promised.
-pub(super) fn check_digest(promised: Option<Sha256>, found: impl FnOnce() -> Sha256) -> Result<()> {
-    let Some(promised) = promised else { return Ok(()) };
-    let found = found();
-    if found == promised {
+/// Rejects a body with another hash than `Content-Digest` states.
+pub(super) fn check_digest(expected: Option<Sha256>, hash: impl FnOnce() -> Sha256) -> Result<()> {
+    let Some(expected) = expected else { return Ok(()) };
+    let actual = hash();
+    if actual == expected {
         return Ok(());
     }
-    let detail = format!("Content-Digest says {promised}, the bytes have {found}");
+    let detail = format!(
+        "Content-Digest states the SHA-256 {expected}, but the received bytes have {actual}"
+    );
     Err(ApiError::new(Code::HashMismatch, detail))
 }
 
@@ -187,8 +192,8 @@ fn pointer(path: &serde_path_to_error::Path) -> String {
     pointer
 }
 
-/// The key against making a thing twice that came with this request. The request is hashed as it was
-/// understood, so that white space and the order of fields do not matter.
+/// The `Idempotency-Key` of a request, with a hash of the parsed request. White space and the order of fields do not
+/// change the hash.
 pub(super) fn request_key<T: Serialize>(
     headers: &HeaderMap,
     request: &T,
@@ -196,7 +201,7 @@ pub(super) fn request_key<T: Serialize>(
     hashed_key(idempotency_key(headers)?, request)
 }
 
-/// A key with the hash of its request.
+/// An idempotency key with the hash of its request.
 pub(super) fn hashed_key<T: Serialize>(
     key: Option<String>,
     request: &T,
@@ -206,7 +211,12 @@ pub(super) fn hashed_key<T: Serialize>(
     Ok(Some(RequestKey { key, request: Sha256::of(&text) }))
 }
 
-/// The status of an answer to a request that makes a thing, and the thing.
+/// Parses a decimal number without sign and leading zeros, so that each file and picture has a single address.
+pub(super) fn canonical_number(text: &str) -> Option<usize> {
+    text.parse().ok().filter(|number: &usize| number.to_string() == text)
+}
+
+/// The status and the identifier in the answer to a request that creates something.
 pub(super) fn created<Id>(inserted: Inserted<Id>) -> (StatusCode, Id) {
     match inserted {
         Inserted::New(id) => (StatusCode::CREATED, id),

@@ -1,4 +1,4 @@
-//! `/v1/jobs`: asking for a reconstruction and watching it.
+//! `/v1/jobs`: reconstructions.
 
 use std::str::FromStr;
 
@@ -26,8 +26,8 @@ use store::{
     NewJob, Page, RequestKey, Span, StoreError,
 };
 
-/// The longest pause that a refused client is asked to make, in seconds.
-const LONGEST_PAUSE: f64 = 600.0;
+/// Largest value of `Retry-After` when the queue is full, in seconds.
+const MAX_RETRY_SECONDS: f64 = 600.0;
 
 /// A job with its progress.
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -100,8 +100,8 @@ impl JobProblem {
 }
 
 impl JobBody {
-    /// Its address.
-    pub(super) fn place(&self) -> String {
+    /// Address of the job.
+    pub(super) fn address(&self) -> String {
         format!("/v1/jobs/{}", self.id)
     }
 
@@ -157,7 +157,7 @@ pub(super) struct ListQuery {
     created_before: Option<Timestamp>,
 }
 
-/// One state, or several with commas between them.
+/// One or several states, separated by commas.
 #[derive(Debug, DeserializeFromStr)]
 struct States(Vec<JobState>);
 
@@ -169,7 +169,7 @@ impl FromStr for States {
             name.parse::<JobState>().map_err(|_| {
                 let names = JobState::VARIANTS.iter().map(|state| state.into_str());
                 let names = names.collect::<Vec<_>>().join(", ");
-                format!("{name:?} is no state; states are {names}")
+                format!("{name:?} is not a state; states are {names}")
             })
         };
         text.split(',').map(state).collect::<Result<_, _>>().map(Self)
@@ -216,11 +216,11 @@ pub(super) async fn create(
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
     let (status, body) = make(&app, &access, request, key).await?;
-    let location = [(header::LOCATION, body.place())];
+    let location = [(header::LOCATION, body.address())];
     Ok((location, changed(status, &body)?).into_response())
 }
 
-/// Makes a job, or finds the one that was made with the same key.
+/// Creates a job, or returns the one that was created with the same key.
 pub(super) async fn make(
     app: &App,
     access: &Access,
@@ -235,7 +235,7 @@ pub(super) async fn make(
     Ok((status, body(app, &access.lab, id).await?))
 }
 
-/// Accepts a job, if there is room for it.
+/// Adds a job if the queue and the disk have space for it.
 async fn insert(
     app: &App,
     access: &Access,
@@ -258,14 +258,14 @@ async fn insert(
 /// Estimated seconds until a job ends: the time for all jobs, divided by their number.
 async fn next_end(app: &App) -> Result<u64> {
     let Estimate { eta_seconds, queue_position } = app.store.estimate(&[]).await?;
-    let seconds = eta_seconds.unwrap_or(LONGEST_PAUSE) / queue_position.max(1) as f64;
-    Ok(seconds.clamp(1.0, LONGEST_PAUSE).ceil() as u64)
+    let seconds = eta_seconds.unwrap_or(MAX_RETRY_SECONDS) / queue_position.max(1) as f64;
+    Ok(seconds.clamp(1.0, MAX_RETRY_SECONDS).ceil() as u64)
 }
 
-/// Checks a request against the measurement that it names.
+/// Resolves a request: checks it against its measurement, and fills in the defaults.
 async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobSpec> {
     let lab = &access.lab;
-    let beyond_role = role_error(access, request.priority);
+    let invalid_priority = role_error(access, request.priority);
     let measurement = app.store.measurement(lab, request.measurement).await;
     let measurement =
         measurement.map_err(|error| ApiError::reference("/measurement", error))?.facts;
@@ -286,10 +286,10 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
         }
     };
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
-    let resolved = beyond_role.map_or(resolved, |error| Err(vec![error]));
+    let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
-    // If the report is not made yet, its end adds the warning.
+    // If the report is not finished yet, the task that writes it adds the warning.
     let report = app.store.report(calibration.id).await?;
     spec.warnings.extend(report.and_then(|report| report.warning()));
     check_memory(app, &spec)?;
@@ -297,26 +297,26 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     Ok(spec)
 }
 
-/// What is wrong with a priority that would put a lab's job before those of all others.
+/// The error of a priority that the role may not set: only admins may place a job ahead of other labs.
 fn role_error(access: &Access, priority: i32) -> Option<InvalidField> {
     let role = access.role;
     (priority > 0 && role < Role::Admin).then(|| {
         let detail = format!(
-            "priority is {priority}; with a token of role {role} it must be from -100 to 0: only an \
-             admin puts a job before those of other labs"
+            "priority is {priority}; with role {role} it must be from -100 to 0, because only an admin may \
+             place a job ahead of other labs"
         );
         InvalidField::new("/priority", detail)
     })
 }
 
-/// The warnings about the snapshots of a job.
+/// The warnings that concern the snapshots of a job.
 fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding> {
     let concerns =
         |warning: &Finding| warning.snapshot.is_none_or(|snapshot| snapshots.contains(snapshot));
     warnings.into_iter().filter(concerns).collect()
 }
 
-/// Refuses a job that no worker could do.
+/// Rejects a job that needs more memory than a worker has.
 fn check_memory(app: &App, spec: &JobSpec) -> Result<()> {
     let (needed, allowed) = (spec.worker_bytes() >> 20, app.settings.worker_memory_bytes >> 20);
     if needed <= allowed {
@@ -330,15 +330,16 @@ fn check_memory(app: &App, spec: &JobSpec) -> Result<()> {
     Err(ApiError::field("/tile/size", detail))
 }
 
-/// Refuses a job with a network while none can be run.
+/// Rejects a job with a network if the service can't run networks.
 fn check_networks(app: &App, spec: &JobSpec) -> Result<()> {
     if spec.model.is_none() && !spec.schedule.needs_network() {
         return Ok(());
     }
     app.networks().map_err(|missing| {
         let name = spec.algorithm.into_str();
-        let detail =
-            format!("{name} runs a network, and this service has {missing}; gap-tv3d needs none");
+        let detail = format!(
+            "{name} runs a network, and this service has {missing}; gap-tv3d needs no network"
+        );
         ApiError::field("/algorithm", detail)
     })
 }
@@ -352,7 +353,7 @@ async fn body(app: &App, lab: &Lab, id: JobId) -> Result<JobBody> {
     Ok(body)
 }
 
-/// Adds a finding to jobs whose tiles no worker takes.
+/// Adds a finding to unfinished jobs if no worker takes tiles.
 async fn warn_of_tiles(app: &App, jobs: &mut [JobBody]) -> Result<()> {
     let waits = |job: &&mut JobBody| {
         matches!(job.state, JobState::Queued | JobState::Running)
@@ -369,7 +370,7 @@ async fn warn_of_tiles(app: &App, jobs: &mut [JobBody]) -> Result<()> {
     Ok(())
 }
 
-/// `GET /v1/jobs`, of one lab or of all of them, with an ETag, so that watching costs little.
+/// `GET /v1/jobs`: the jobs of one lab or of all labs, with an ETag, so that polling is cheap.
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
@@ -395,7 +396,7 @@ pub(super) async fn list(
     PageBody::new(page, |item: &JobBody| item.id.to_string(), |item| item).answer(&request)
 }
 
-/// `GET /v1/jobs/{job}`, with an ETag, so that watching costs little.
+/// `GET /v1/jobs/{job}`: a job, with an ETag, so that polling is cheap.
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
@@ -417,8 +418,8 @@ pub(super) async fn change(
     Body(changes): Body<Changes>,
 ) -> Result<Response> {
     let Changes { label, priority } = changes;
-    let wrong = priority.and_then(|to| priority_error(to).or_else(|| role_error(&access, to)));
-    if let Some(error) = wrong {
+    let invalid = priority.and_then(|to| priority_error(to).or_else(|| role_error(&access, to)));
+    if let Some(error) = invalid {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
     let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
@@ -426,7 +427,7 @@ pub(super) async fn change(
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 
-/// `POST /v1/jobs/estimate`: what a job would take, which is checked as one that is meant.
+/// `POST /v1/jobs/estimate`: the predicted cost of a job. The request is checked as if it were to be submitted.
 pub(super) async fn estimate(
     Caller(app, access): Caller,
     Body(request): Body<JobRequest>,
@@ -481,7 +482,9 @@ pub(super) async fn delete(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// The job, if it has this snapshot; else there is no such thing.
+/// The job.
+///
+/// Errors: 404 if the job or this snapshot of it does not exist.
 pub(super) async fn with_snapshot(app: &App, lab: &Lab, id: JobId, snapshot: u32) -> Result<Job> {
     let job = app.store.job(lab, id).await?;
     if job.spec.snapshots.contains(snapshot) {

@@ -21,7 +21,7 @@ pub(super) struct LabBody {
     share: f64,
     limits: LimitsBody,
     #[serde(rename = "use")]
-    taken: TakenBody,
+    usage: UsageBody,
 }
 
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -35,11 +35,11 @@ struct LimitsBody {
 
 #[derive(Debug, Serialize, schemars::JsonSchema)]
 #[schemars(rename = "LabUsage")]
-struct TakenBody {
+struct UsageBody {
     /// Bytes that the lab keeps, with the space promised to its jobs.
     bytes: u64,
     #[serde(flatten)]
-    of: LabUse,
+    lab: LabUse,
     /// Planned CPU seconds of unfinished jobs.
     cpu_seconds_left: f64,
 }
@@ -96,9 +96,9 @@ pub(super) async fn change(
     let Changes { share, bytes, jobs } = changes;
     let mut errors: Vec<_> =
         share.and_then(share_error).map(|e| InvalidField::new("/share", e)).into_iter().collect();
-    for (place, limit) in [("/bytes", bytes), ("/jobs", jobs)] {
+    for (pointer, limit) in [("/bytes", bytes), ("/jobs", jobs)] {
         if limit.flatten().is_some_and(|limit| i64::try_from(limit).is_err()) {
-            errors.push(InvalidField::new(place, "a limit is below 2^63"));
+            errors.push(InvalidField::new(pointer, "a limit must be below 2^63"));
         }
     }
     if !errors.is_empty() {
@@ -116,9 +116,9 @@ async fn one(app: &App, lab: &str) -> Result<LabBody> {
 
 async fn body(app: &App, row: LabRow, costs: &HashMap<Lab, f64>) -> Result<LabBody> {
     let bytes = app.store.lab_bytes(&row.lab).await?;
-    let of = app.store.lab_use(&row.lab).await?;
+    let lab = app.store.lab_use(&row.lab).await?;
     let limits = LimitsBody { bytes: row.max_bytes, jobs: row.max_jobs };
     let cpu_seconds_left = costs.get(&row.lab).copied().unwrap_or_default();
-    let taken = TakenBody { bytes, of, cpu_seconds_left };
-    Ok(LabBody { lab: row.lab, share: row.share, limits, taken })
+    let usage = UsageBody { bytes, lab, cpu_seconds_left };
+    Ok(LabBody { lab: row.lab, share: row.share, limits, usage })
 }

@@ -23,7 +23,7 @@ pub(super) struct MeBody {
     all_labs: bool,
     limits: LimitsBody,
     #[serde(rename = "use")]
-    taken: UseBody,
+    usage: UseBody,
 }
 
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -70,6 +70,6 @@ pub(super) async fn show(Caller(app, access): Caller, request: RequestContext) -
             lab_jobs,
             worker_memory_bytes: app.settings.worker_memory_bytes,
         },
-        taken: UseBody { token_bytes, lab },
+        usage: UseBody { token_bytes, lab },
     })
 }

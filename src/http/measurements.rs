@@ -85,7 +85,7 @@ impl TryFrom<Request> for MeasurementBody {
 
     fn try_from(request: Request) -> Result<Self> {
         let (state, error, problem) = pending(&request);
-        let Submission::Measurement(asked) = request.submission else {
+        let Submission::Measurement(submission) = request.submission else {
             return Err(
                 StoreError::NotFound { what: "measurement", id: request.id.to_string() }.into()
             );
@@ -97,8 +97,8 @@ impl TryFrom<Request> for MeasurementBody {
             problem,
             created_at: request.created_at,
             name: request.name,
-            calibration: asked.calibration,
-            data: asked.data,
+            calibration: submission.calibration,
+            data: submission.data,
             format: None,
             sample: None,
             axes: None,
@@ -106,10 +106,10 @@ impl TryFrom<Request> for MeasurementBody {
             height: None,
             width: None,
             full_scale: None,
-            camera_fps: asked.camera_fps,
-            exposure_s: asked.exposure_s,
+            camera_fps: submission.camera_fps,
+            exposure_s: submission.exposure_s,
             sequence: None,
-            dark: asked.dark,
+            dark: submission.dark,
             warnings: Vec::new(),
             reading: None,
         })
@@ -129,13 +129,13 @@ impl TryFrom<Asked<Measurement>> for MeasurementBody {
 
 pub(super) async fn create(
     Caller(app, access): Caller,
-    asked: RequestContext,
+    context: RequestContext,
     Body(request): Body<MeasurementRequest>,
 ) -> Result<Response> {
-    let (key, wait) = (request_key(&asked.headers, &request)?, asked.wait());
-    let request = Submission::Measurement(request);
-    let made = make(&app, &access, request, key.as_ref(), wait.time(PATIENCE)).await?;
-    let (status, id) = created(made);
+    let (key, wait) = (request_key(&context.headers, &request)?, context.wait());
+    let submission = Submission::Measurement(request);
+    let inserted = make(&app, &access, submission, key.as_ref(), wait.time(PATIENCE)).await?;
+    let (status, id) = created(inserted);
     let body = body(&app, &access.lab, id).await?;
     let status = if body.state == Stage::Ready { status } else { StatusCode::ACCEPTED };
     let location = [(header::LOCATION, format!("/v1/measurements/{id}"))];
@@ -166,8 +166,8 @@ pub(super) async fn show(
 ) -> Result<Response> {
     let wait = request.wait();
     if let Some(time) = app.wait(wait) {
-        let what = (Made::Measurement, id.into());
-        app.events.settled(&app.store, &access.lab, what, time).await?;
+        let resource = (Made::Measurement, id.into());
+        app.events.settled(&app.store, &access.lab, resource, time).await?;
     }
     Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
 }

@@ -1,4 +1,4 @@
-//! The figures of this process for Prometheus. Requests are counted as they go by.
+//! Metrics for Prometheus. Requests are counted in this process; figures of labs and tasks come from the database.
 
 use std::sync::OnceLock;
 use std::time::Duration;
@@ -13,12 +13,12 @@ use store::{LabFigures, TaskTotals};
 const REQUEST_SECONDS: &str = "sci_recon_http_request_duration_seconds";
 const BUCKETS: [f64; 10] = [0.001, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0, 30.0];
 
-/// The figures of this process.
+/// The metrics of this process.
 #[derive(Debug, Clone)]
 pub struct Metrics(PrometheusHandle);
 
 impl Metrics {
-    /// Begins to count, for the whole process; a second call gives the same figures.
+    /// Installs the recorder of this process. A second call returns the same metrics.
     pub fn install() -> Result<Self, BuildError> {
         static HANDLE: OnceLock<PrometheusHandle> = OnceLock::new();
         if let Some(handle) = HANDLE.get() {
@@ -31,7 +31,7 @@ impl Metrics {
         Ok(Self(HANDLE.get_or_init(|| handle).clone()))
     }
 
-    /// Folds what was observed into the histograms; to be called every few seconds.
+    /// Merges new observations into the histograms. Call this every few seconds.
     pub fn upkeep(&self) {
         self.0.run_upkeep();
     }
@@ -46,8 +46,8 @@ fn describe() {
     describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "Time from a request to its answer.");
     describe_counter!("sci_recon_upload_bytes_total", Unit::Bytes, "Bytes of uploads received.");
     describe_counter!("sci_recon_worker_exits_total", "Worker processes that ended, by reason.");
-    describe_gauge!("sci_recon_jobs", "Jobs on record, by state.");
-    describe_gauge!("sci_recon_tasks", "Tasks on record, by kind and state.");
+    describe_gauge!("sci_recon_jobs", "Jobs in the database, by state.");
+    describe_gauge!("sci_recon_tasks", "Tasks in the database, by kind and state.");
     describe_counter!("sci_recon_tasks_done_total", "Tasks done, by kind.");
     describe_counter!("sci_recon_solver_iterations_total", "Solver iterations done.");
     describe_counter!("sci_recon_denoiser_passes_total", "Passes of the deep denoiser done.");
@@ -59,7 +59,7 @@ fn describe() {
     describe_gauge!("sci_recon_workers", "Worker processes alive.");
     describe_gauge!(
         "sci_recon_tile_workers",
-        "Workers alive that take tiles, here and on other machines."
+        "Workers alive that take tiles, on this machine and others."
     );
     describe_gauge!("sci_recon_blobs", "Files in the content-addressed store.");
     describe_gauge!("sci_recon_blob_bytes", Unit::Bytes, "Bytes of files in that store.");
@@ -68,26 +68,28 @@ fn describe() {
     describe_gauge!("sci_recon_disk_size_bytes", Unit::Bytes, "Bytes of the disk.");
 }
 
-/// Labs with figures of their own; those of the others are added up as `lab="_others"`, which is no lab's name.
-const MOST_LABS: usize = 100;
+/// Number of labs with separate figures. The figures of all other labs are added up as `lab="_others"`, which is not a
+/// valid name of a lab.
+const MAX_LABS: usize = 100;
 
-/// Figures that are read of the database for each answer, and may differ by who asks.
+/// Figures that are read from the database for each answer. They depend on the access of the request.
 #[derive(Debug, Default)]
 pub(super) struct Figures(String);
 
 impl Figures {
-    /// Begins a figure with its kind (`counter` or `gauge`) and what it is.
-    fn describe(&mut self, name: &str, kind: &str, about: &str) {
-        self.0 += &format!("# HELP {name} {about}\n# TYPE {name} {kind}\n");
+    /// Writes the header of a figure. Its kind is `counter` or `gauge`.
+    fn describe(&mut self, name: &str, kind: &str, help: &str) {
+        self.0 += &format!("# HELP {name} {help}\n# TYPE {name} {kind}\n");
     }
 
-    /// The labels' values are names of ours, which need no escapes.
+    /// Writes a value. Values of labels are names from the service, which need no escaping.
     fn add(&mut self, name: &str, labels: &[(&str, &str)], value: f64) {
-        let labels: Vec<_> = labels.iter().map(|(key, of)| format!("{key}=\"{of}\"")).collect();
+        let labels: Vec<_> =
+            labels.iter().map(|(key, value)| format!("{key}=\"{value}\"")).collect();
         self.0 += &format!("{name}{{{}}} {value}\n", labels.join(","));
     }
 
-    /// Seconds of tasks done, by kind.
+    /// Adds the duration of finished tasks, by kind.
     pub(super) fn add_tasks(&mut self, totals: &[TaskTotals]) {
         let name = "sci_recon_task_seconds_total";
         self.describe(name, "counter", "Seconds of tasks done.");
@@ -99,13 +101,15 @@ impl Figures {
     #[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
     pub(super) fn add_labs(&mut self, labs: &[LabFigures]) {
         let name = |lab: usize| {
-            labs.get(lab).filter(|_| lab < MOST_LABS).map_or("_others", |of| of.lab.as_str())
+            labs.get(lab)
+                .filter(|_| lab < MAX_LABS)
+                .map_or("_others", |figures| figures.lab.as_str())
         };
-        let own = |lab: &LabFigures, state| lab.jobs.get(&state).copied().unwrap_or_default();
+        let jobs = |lab: &LabFigures, state| lab.jobs.get(&state).copied().unwrap_or_default();
         let figure = "sci_recon_lab_jobs";
-        self.describe(figure, "gauge", "Jobs of a lab on record, by state.");
+        self.describe(figure, "gauge", "Jobs of a lab in the database, by state.");
         for &state in JobState::VARIANTS {
-            for (lab, value) in folded(labs, |lab| own(lab, state) as f64) {
+            for (lab, value) in with_others_added_up(labs, |lab| jobs(lab, state) as f64) {
                 self.add(figure, &[("lab", name(lab)), ("state", state.into_str())], value);
             }
         }
@@ -114,19 +118,19 @@ impl Figures {
             (
                 "sci_recon_lab_jobs_begun_total",
                 "counter",
-                "Jobs of a lab that have begun.",
+                "Jobs of a lab that have started.",
                 |lab| lab.jobs_begun as f64,
             ),
             (
                 "sci_recon_lab_wait_seconds_total",
                 "counter",
-                "Seconds that those jobs waited for their first task.",
+                "Seconds that started jobs of a lab waited for their first task.",
                 |lab| lab.wait_seconds,
             ),
             (
                 "sci_recon_lab_cpu_seconds_total",
                 "counter",
-                "Processor seconds of a lab's tasks that are done.",
+                "CPU seconds of finished tasks of a lab.",
                 |lab| lab.cpu_seconds,
             ),
             (
@@ -138,13 +142,13 @@ impl Figures {
             (
                 "sci_recon_lab_longest_wait_seconds",
                 "gauge",
-                "For how long a lab's oldest job waits that has not begun; of _others in sum.",
+                "Waiting time of the oldest job of a lab that has not started; _others is a sum.",
                 |lab| lab.longest_wait,
             ),
         ];
-        for (figure, kind, about, value) in figures {
-            self.describe(figure, kind, about);
-            for (lab, value) in folded(labs, value) {
+        for (figure, kind, help, value) in figures {
+            self.describe(figure, kind, help);
+            for (lab, value) in with_others_added_up(labs, value) {
                 self.add(figure, &[("lab", name(lab))], value);
             }
         }
@@ -155,17 +159,20 @@ impl Figures {
     }
 }
 
-/// A value for each of the first labs, and the sum of the others' in the place after them.
-fn folded(labs: &[LabFigures], value: impl Fn(&LabFigures) -> f64) -> Vec<(usize, f64)> {
-    let (named, others) = labs.split_at(labs.len().min(MOST_LABS));
+/// The value of each of the first labs, with its index. The last item is the sum of all other labs.
+fn with_others_added_up(
+    labs: &[LabFigures],
+    value: impl Fn(&LabFigures) -> f64,
+) -> Vec<(usize, f64)> {
+    let (named, others) = labs.split_at(labs.len().min(MAX_LABS));
     let mut values: Vec<_> = named.iter().map(&value).enumerate().collect();
     if !others.is_empty() {
-        values.push((MOST_LABS, others.iter().map(value).sum()));
+        values.push((MAX_LABS, others.iter().map(value).sum()));
     }
     values
 }
 
-/// Counts a request. `route` is the pattern and not the path: there are few patterns.
+/// Counts a request. `route` is the pattern and not the path, which limits the number of time series.
 pub(super) fn observe(method: &str, route: &str, status: u16, took: Duration) {
     let (method, route) = (method.to_owned(), route.to_owned());
     counter!("sci_recon_http_requests_total", "method" => method.clone(), "route" => route.clone(),
@@ -178,7 +185,7 @@ pub(super) fn observe(method: &str, route: &str, status: u16, took: Duration) {
 mod tests {
     use std::collections::HashMap;
 
-    use super::{Figures, MOST_LABS};
+    use super::{Figures, MAX_LABS};
     use engine::job::JobState;
     use store::LabFigures;
 
@@ -193,7 +200,7 @@ mod tests {
             cpu_seconds: 0.25,
             result_bytes: 7,
         };
-        let labs: Vec<_> = (0..MOST_LABS + 4).map(lab).collect();
+        let labs: Vec<_> = (0..MAX_LABS + 4).map(lab).collect();
         let mut figures = Figures::default();
         figures.add_labs(&labs);
         let text = figures.into_text();

@@ -1,4 +1,4 @@
-//! `/v1/models`: end-to-end networks, each for one calibration.
+//! `/v1/models`: end-to-end networks, each trained for one calibration.
 
 use std::time::Duration;
 
@@ -14,7 +14,8 @@ use super::submissions::make;
 use engine::job::{Lab, ModelId, ModelRequest, Submission};
 use store::{Model, StoreError};
 
-/// How long a request waits for the check of a network, which may wait for others. It has no state to be asked for.
+/// Time for which a request waits for the check of a network, including checks that run before it. A client can't poll a
+/// pending model, because it has no state.
 const PATIENCE: Duration = Duration::from_secs(900);
 
 pub(super) async fn create(
@@ -23,13 +24,13 @@ pub(super) async fn create(
     Body(request): Body<ModelRequest>,
 ) -> Result<Response> {
     let key = request_key(&headers, &request)?;
-    let made = make(&app, &access, Submission::Model(request), key.as_ref(), PATIENCE).await?;
-    let (status, id) = created::<ModelId>(made);
+    let inserted = make(&app, &access, Submission::Model(request), key.as_ref(), PATIENCE).await?;
+    let (status, id) = created::<ModelId>(inserted);
     let location = [(header::LOCATION, format!("/v1/models/{id}"))];
     let model = app.store.model(&access.lab, id).await.map_err(|error| match error {
         StoreError::NotFound { .. } => {
             let detail =
-                "the check of the network goes on: send the request again, with an Idempotency-Key";
+                "the check of the network takes long: send the request again, with an Idempotency-Key, to wait for it";
             ApiError::new(Code::TimedOut, detail)
         }
         error => error.into(),

@@ -1,4 +1,4 @@
-//! Pages of lists, and queries that several kinds of things share.
+//! Pages of lists, and query parameters that several routes share.
 
 use std::str::FromStr;
 
@@ -13,12 +13,12 @@ use super::error::ApiError;
 use engine::job::{CalibrationId, Label, Timestamp};
 use store::{Filter, Page, Span};
 
-/// How many items a page has where nobody says.
+/// Default number of items on a page.
 const DEFAULT: u32 = 50;
-/// How many items a page has at most.
+/// Largest number of items on a page.
 const MAX: u32 = 200;
 
-/// The `limit` of a list, on 1 to 200.
+/// The parameter `limit` of a list: the number of items on a page, from 1 to 200.
 #[derive(Debug, Clone, Copy, Deserialize)]
 #[serde(try_from = "u32")]
 pub(super) struct Limit(u32);
@@ -46,7 +46,7 @@ impl Limit {
     }
 }
 
-/// The query of a list of things that belong to calibrations.
+/// The query of a list of resources that belong to calibrations.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, bound = "Id: FromStr")]
 pub(super) struct ListQuery<Id> {
@@ -81,7 +81,7 @@ impl<T: FromStr> FromStr for Cursor<T> {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let bytes = URL_SAFE_NO_PAD.decode(text).ok();
         let place = bytes.and_then(|bytes| String::from_utf8(bytes).ok()?.parse().ok());
-        place.map(Self).ok_or("cursor is none of this list: take it from next_cursor")
+        place.map(Self).ok_or("cursor is invalid for this list: use the value of next_cursor")
     }
 }
 

@@ -1,5 +1,4 @@
-//! `/problems/{code}`: what a code of an error means and what to do, at the address that errors name as
-//! their `type`.
+//! `/problems/{code}`: a page that explains a code of an error. The header `Link` of an error leads to it.
 
 use axum::http::{HeaderMap, HeaderValue, header};
 use axum::response::Response;
@@ -9,7 +8,7 @@ use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::Params;
 
-/// What the browser may load: our own style, and no script at all.
+/// Content security policy: the browser loads the style sheet of the service, and no scripts.
 const POLICY: &str = "default-src 'none'; style-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
@@ -25,7 +24,7 @@ pub(super) async fn show(Params(name): Params<String>, headers: HeaderMap) -> Re
 
 fn page(code: Code) -> String {
     let (status, title, retryable) = code.row();
-    let again = if retryable { "may succeed later" } else { "fails again" };
+    let outcome = if retryable { "may succeed later" } else { "would fail again" };
     html! {
         (DOCTYPE)
         html lang="en" {
@@ -39,8 +38,8 @@ fn page(code: Code) -> String {
                 main {
                     h1 { (title) }
                     p { code { (code.into_str()) } ", status " (status.as_u16()) ". " (meaning(code)) }
-                    p { "The same request " (again) "; " code { "retryable" } " of the answer says so." }
-                    p { a href="../openapi.yaml" { "The contract" } " has all codes." }
+                    p { "The same request " (outcome) ", unless " code { "retryable" } " of the answer is different." }
+                    p { a href="../openapi.yaml" { "The API description" } " lists all codes." }
                 }
             }
         }
@@ -48,94 +47,105 @@ fn page(code: Code) -> String {
     .into_string()
 }
 
-/// What it means, and what to do.
+/// Meaning of a code, and instructions for the user.
 pub(super) fn meaning(code: Code) -> &'static str {
     match code {
-        Code::MalformedJson => "The body is no JSON. The detail has line and column.",
-        Code::MalformedRequest => {
-            "A header, the form or the body can't be read, or the body was broken off. The detail says \
-             which."
+        Code::MalformedJson => {
+            "The body is not valid JSON. The detail has the line and the column."
         }
-        Code::InvalidQuery => "A query parameter is unknown or has a value that can't be.",
-        Code::EmptyBody => "A body is needed.",
+        Code::MalformedRequest => {
+            "A header, a form or the body can't be parsed, or the body is incomplete. The detail says which."
+        }
+        Code::InvalidQuery => "A query parameter is unknown, or its value is invalid.",
+        Code::EmptyBody => "The request needs a body.",
         Code::Unauthorized => {
-            "Send a token as Authorization: Bearer. One that is unknown, misspelled, expired or revoked is \
-             answered in the same way; who looks after the service makes a new one."
+            "Send a token as Authorization: Bearer. Unknown, misspelled, expired and revoked tokens get the \
+             same answer. An administrator of the service can create a new token."
         }
         Code::Forbidden => {
-            "The role of the token is too low: read looks, submit changes, admin sees all."
+            "The role of the token is too low. Role read may read, submit may also change, and admin may \
+             access all labs."
         }
         Code::ForeignSite => {
-            "A service without tokens answers only to its own names, and takes no changes from pages of \
-             other sites. Ask at its address, make a token, or start it with --host NAME."
+            "A service without tokens answers only requests to its own host names, and rejects changes from \
+             pages of other sites. Use the address of the service, create a token, or start the service with \
+             --host NAME."
         }
         Code::NotFound => {
-            "There is none with this identifier, or it belongs to another lab, or the address is wrong."
+            "No resource has this address or identifier, or it belongs to another lab."
         }
         Code::NotReady => {
-            "The job or the calibration has not come that far. Its state says how far it is."
+            "The job or the calibration has not reached this step yet. Its state shows the progress."
         }
         Code::CalibrationNotReady => {
-            "The masks of the calibration are still being made or checked; wait for the state ready. One that has \
-             failed will never be ready: its error says why."
+            "The masks of the calibration are still being computed or checked. Wait until its state is \
+             ready. A failed calibration never becomes ready; its error has the reason."
         }
         Code::MeasurementNotReady => {
-            "The measurement is still being checked; wait for the state ready. One that has failed will never \
-             be ready: its problem says why."
+            "The measurement is still being checked. Wait until its state is ready. A failed measurement \
+             never becomes ready; its problem has the reason."
         }
-        Code::MethodNotAllowed => "The header Allow names the methods that this address takes.",
+        Code::MethodNotAllowed => "The header Allow lists the methods of this address.",
         Code::UploadStalled => {
-            "No byte came for too long. Send it again, best in pieces (/v1/uploads)."
+            "The service received no data for too long. Send the file again, preferably as a resumable \
+             upload (/v1/uploads)."
         }
-        Code::OffsetMismatch => "HEAD of the upload tells where the next piece begins.",
+        Code::OffsetMismatch => {
+            "Send HEAD to the upload: Upload-Offset is the offset of the next piece."
+        }
         Code::TusVersion => "Send the header Tus-Resumable: 1.0.0.",
         Code::PreconditionFailed => {
-            "If-Match names a state that is over. Ask for the thing again, and decide anew."
+            "The resource has changed since the state that If-Match names. Read it again, and decide whether \
+             the change is still needed."
         }
-        Code::UploadBusy => "Another request writes to this upload. Wait for it, or for its end.",
+        Code::UploadBusy => "Another request is writing to this upload. Wait until it ends.",
         Code::UploadDamaged => {
-            "Bytes that had come are no longer on the disk as they were. Send the file again."
+            "The received bytes are lost or damaged on the disk of the service. Send the file again."
         }
-        Code::ChecksumMismatch => "The piece was damaged on its way. Send it again.",
-        Code::InUse => "Others refer to it. Delete those first; the detail counts them.",
+        Code::ChecksumMismatch => "The piece was damaged in transit. Send it again.",
+        Code::InUse => {
+            "Other resources refer to this one. Delete those first; the detail counts them."
+        }
         Code::IllegalState => {
-            "A job that has succeeded can't be cancelled, for one. Its state says more."
+            "The state of the resource does not allow this. For example, a succeeded job can't be cancelled."
         }
-        Code::TooLarge => "The limit stands in the detail.",
-        Code::UnsupportedMediaType => "The header Content-Type is not the one that is needed.",
-        Code::RangeNotSatisfiable => "The range begins behind the end of the file.",
-        Code::InvalidRequest => "Each of errors names a field and says what would be right.",
+        Code::TooLarge => "The body is larger than the limit in the detail.",
+        Code::UnsupportedMediaType => {
+            "The header Content-Type or Content-Encoding has an unsupported value. The detail has the right \
+             one."
+        }
+        Code::RangeNotSatisfiable => "The range begins after the end of the file.",
+        Code::InvalidRequest => "Each item of errors names a field and its allowed values.",
         Code::InvalidContent => {
-            "The file itself is wrong: the detail says in what way, reason in one word."
+            "The file is invalid. The detail describes the fault; reason is a short name of it."
         }
-        Code::SizeMismatch => "Rows, columns or frames differ between things that belong together.",
+        Code::SizeMismatch => "Rows, columns or frames of related resources differ.",
         Code::HashMismatch => {
-            "The bytes have another SHA-256 than the one that was named. Send them again."
+            "The received bytes have another SHA-256 than the request states. Send them again."
         }
         Code::IdempotencyKeyReused => {
-            "The key belongs to another request. Take a new key for each thing that is to be made."
+            "The key was used for a different request. Use a new key for each new resource."
         }
         Code::TooManyUploads => {
-            "All places for uploads are taken, or the lab has its share, or too many of its uploads in pieces \
-             are not complete. Come back after Retry-After seconds."
+            "The service or the lab has too many uploads at the same time, or too many incomplete \
+             resumable uploads. Retry after the seconds in Retry-After."
         }
         Code::TooManyWaiters => {
-            "So many requests of the lab wait for the end of jobs that this one may not. Ask without wait, or \
-             listen to /v1/events, which tells of all jobs at once."
+            "Too many requests of the lab wait for jobs. Send the request without wait, or listen to \
+             /v1/events, which reports changes of all jobs."
         }
         Code::TooManyChecks => {
-            "So many files of the lab wait to be checked that this one may not. Come back when some are done."
+            "Too many files of the lab wait for a check. Retry when some checks are finished."
         }
         Code::RateLimited => {
-            "The token has sent more requests than it may in a minute. Continue after Retry-After seconds."
+            "The token has sent more requests than allowed in a minute. Continue after the seconds in Retry- \
+             After."
         }
-        Code::QueueFull => {
-            "So many jobs wait that no more are taken. Come back later, or cancel some."
-        }
+        Code::QueueFull => "Too many jobs are in the queue. Retry later, or cancel some jobs.",
         Code::Internal => {
             "The log of the service has the cause, under the identifier of the request."
         }
-        Code::TaskFailed => "Mend the cause that the detail names, then retry the job.",
+        Code::TaskFailed => "Fix the cause in the detail, then retry the job.",
         Code::OutOfMemory => {
             "Use smaller tiles, fewer workers or a machine with more memory, then retry the job."
         }
@@ -143,22 +153,25 @@ pub(super) fn meaning(code: Code) -> &'static str {
             "Retry the job. If the worker crashes again, report it with the log of the service."
         }
         Code::WorkerLost => {
-            "Workers were killed or fell silent. See that they keep running, then retry the job."
+            "Workers were killed or stopped responding. Make sure that they keep running, then retry the \
+             job."
         }
         Code::MovieFailed => {
-            "A worker has tried three times; the detail has its reason. Create the movie again for another try."
+            "A worker has tried three times; the detail has the reason. To try again, create the movie \
+             again."
         }
         Code::FileDamaged => {
-            "The disk of the service has lost or changed the file; no byte of it is sent. Retry its job, and it \
-             is made again."
+            "The file is lost or damaged on the disk of the service, so it is not sent. Retry its job to \
+             create the file again."
         }
-        Code::Unavailable => "The service is stopping, or has no place for this just now.",
-        Code::TimedOut => "The answer took longer than answers may.",
+        Code::Unavailable => "The service is shutting down, or has no capacity at the moment.",
+        Code::TimedOut => "The request took longer than the limit of the service.",
         Code::InsufficientStorage => {
-            "Delete jobs and uploads that nobody needs, or ask for a larger disk."
+            "Delete jobs and uploads that are not needed, or use a larger disk."
         }
         Code::QuotaExceeded => {
-            "Delete uploads, jobs or what was prepared, or have the limit raised. The detail has the numbers."
+            "Delete uploads, jobs, or prepared arrays, or ask for a higher limit. The detail has the \
+             numbers."
         }
     }
 }

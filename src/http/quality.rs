@@ -1,4 +1,4 @@
-//! How good frames are, where the truth is known: PSNR and SSIM against an upload.
+//! PSNR and SSIM of frames against true frames that the lab uploaded.
 
 use std::path::Path;
 
@@ -52,7 +52,7 @@ pub(super) async fn show(
     let limits = app.limits;
     let frames = intake::run(&app, &access.lab, move || {
         let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, limits);
-        // Behind a mosaic true frames may have colours, or be as the sensor sees them.
+        // The truth of a colour sensor may have colours, or one colour for each pixel, as the sensor records it.
         let colours = if shape.mosaic.is_some() { truth.open_colours()? } else { None };
         if let Some(colours) = colours {
             return compare((&path, Channels::Rgb), colours, snapshot as usize, shape);
@@ -65,8 +65,8 @@ pub(super) async fn show(
     conditional::json(&QualityBody { truth, peak, quality: quality.relative_to(peak) }, &headers)
 }
 
-/// Compares the frames of a snapshot with those of a truth that has the frames of this snapshot, or
-/// of all snapshots of the measurement. Memory holds a frame of each.
+/// Compares the frames of a snapshot with true frames, of this snapshot or of all snapshots of the measurement. Memory holds
+/// one frame of each.
 fn compare(
     (path, channels): (&Path, Channels),
     mut truth: Opened,
@@ -75,23 +75,23 @@ fn compare(
 ) -> Result<Vec<FrameQuality>> {
     let SceneShape { frames, height, snapshots, mosaic, .. } = shape;
     let width = shape.width * channels.count();
-    let found = truth.info;
+    let info = truth.info;
     let all = frames * snapshots as usize;
-    if (found.height, found.width) != (height, width) || ![frames, all].contains(&found.frames) {
-        let (rows, columns) = (found.height, found.width / channels.count());
+    if (info.height, info.width) != (height, width) || ![frames, all].contains(&info.frames) {
+        let (rows, columns) = (info.height, info.width / channels.count());
         let detail = format!(
             "the truth has {} frames of {rows}x{columns}; it should have {frames} of {height}x{} for this \
              snapshot, or {all} for all",
-            found.frames, shape.width
+            info.frames, shape.width
         );
         return Err(ApiError::new(Code::SizeMismatch, detail));
     }
-    let before = if found.frames == all { snapshot * frames } else { 0 };
-    for _ in 0..before {
+    let skipped = if info.frames == all { snapshot * frames } else { 0 };
+    for _ in 0..skipped {
         next(&mut truth)?;
     }
     let result = npy::open_windows(path, &Limits::default())?;
-    let figures = |k: usize| -> Result<FrameQuality> {
+    let frame_quality = |k: usize| -> Result<FrameQuality> {
         let truth = next(&mut truth)?;
         let frame = result.read_window(k..k + 1, 0..height, 0..result.info().width)?;
         let mut frame = frame.index_axis_move(Axis(0), 0);
@@ -101,7 +101,7 @@ fn compare(
         let quality = FrameQuality::of(k, frame.view(), truth.view(), channels);
         quality.map_err(|error| ApiError::internal(&error))
     };
-    (0..frames).map(figures).collect()
+    (0..frames).map(frame_quality).collect()
 }
 
 fn next(truth: &mut Opened) -> Result<Array2<f32>> {

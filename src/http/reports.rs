@@ -1,4 +1,4 @@
-//! The report of a calibration: as JSON for clients, as a page with maps for people.
+//! The report of a calibration: as JSON, as a page, and its maps as PNG.
 
 use axum::http::{HeaderMap, header};
 use axum::response::Response;
@@ -10,7 +10,7 @@ use super::extract::{Caller, Params};
 use engine::intake::report_page;
 use engine::job::{CalibrationId, CalibrationReport, Lab};
 
-/// What the browser may load: our own style and pictures, and no script at all.
+/// Content security policy: the browser loads the style sheet and pictures of the service, and no scripts.
 const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
 
@@ -55,9 +55,9 @@ pub(super) async fn map(
 }
 
 async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport> {
-    // Whose it is, before what it holds.
+    // Checks first that the calibration belongs to the lab.
     app.store.calibration(lab, id).await?;
     let not_yet =
-        || ApiError::new(Code::NotReady, "the report is not made yet; ask again in a moment");
+        || ApiError::new(Code::NotReady, "the report is not ready yet; try again in a few seconds");
     app.store.report(id).await?.ok_or_else(not_yet)
 }

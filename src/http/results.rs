@@ -10,7 +10,7 @@ use super::app::App;
 use super::context::RequestContext;
 use super::download::Download;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Caller, Params, QueryOf};
+use super::extract::{Caller, Params, QueryOf, canonical_number};
 use super::jobs::with_snapshot;
 use super::page::{Cursor, Limit, PageBody};
 use engine::job::{JobId, JobState, ResultFile};
@@ -53,12 +53,13 @@ pub(super) async fn list(
 ) -> Result<Response> {
     let job = app.store.job(&access.lab, id).await?;
     let after = query.cursor.map(|Cursor(snapshot)| snapshot);
-    let mut left = job.spec.snapshots.indices().filter(|at| after.is_none_or(|after| *at > after));
+    let mut snapshots =
+        job.spec.snapshots.indices().filter(|at| after.is_none_or(|after| *at > after));
     let mut items = Vec::new();
-    for snapshot in left.by_ref().take(query.limit.get() as usize) {
+    for snapshot in snapshots.by_ref().take(query.limit.get() as usize) {
         items.push(body(&app, &job, snapshot, &request).await?);
     }
-    let page = Page { items, more: left.next().is_some() };
+    let page = Page { items, more: snapshots.next().is_some() };
     PageBody::new(page, |item: &SnapshotBody| item.snapshot.to_string(), |item| item)
         .answer(&request)
 }
@@ -89,7 +90,7 @@ async fn body(
     Ok(SnapshotBody { snapshot, ready, files: files.into_iter().map(show).collect() })
 }
 
-/// The export that a result file is.
+/// The path of the export that serves a result file.
 fn export(name: &str) -> Option<String> {
     let format = match name {
         "stack.exr" => "exr",
@@ -106,7 +107,7 @@ fn export(name: &str) -> Option<String> {
     Some(format.to_owned())
 }
 
-/// The result file that `1.exr` or `1.png` means, counted from 1 to `frames`.
+/// The result file of a frame such as `1.exr` or `1.png`. Frames are counted from 1 to `frames`.
 pub(super) fn frame_file(frame: &str, frames: usize) -> Option<String> {
     let (number, kind) = frame.split_once('.')?;
     let folder = match kind {
@@ -114,11 +115,11 @@ pub(super) fn frame_file(frame: &str, frames: usize) -> Option<String> {
         "png" => "png",
         _ => return None,
     };
-    let number: usize = number.parse().ok().filter(|n: &usize| n.to_string() == number)?;
+    let number = canonical_number(number)?;
     (1..=frames).contains(&number).then(|| format!("{folder}/frame_{number:04}.{kind}"))
 }
 
-/// Answers with a result file, or the part of it that is asked for.
+/// Answers with a result file, or the requested range of it.
 pub(super) async fn send(
     app: &App,
     job: &Job,
@@ -132,19 +133,20 @@ pub(super) async fn send(
         size: file.size,
         kind: media_type(name),
         disposition: format!("inline; {}", file_name(job.id, snapshot, name)),
-        // Part of a JSON document would not be one.
-        in_parts: media_type(name) != "application/json",
+        // A range of a JSON document is not valid JSON.
+        accepts_ranges: media_type(name) != "application/json",
     };
     let open = async { Ok(app.store.open_result(job, snapshot, name).await?.2) };
     download.send(open, request).await
 }
 
-/// Why there is no `error.npy`.
+/// The reason why a finished job has no `error.npy`.
 const NO_PREDICTION: &str =
     "no error can be predicted for frames of this algorithm, schedule or sensor";
 
-/// A result file as it is on record, and where it lies.
-/// Errors: 404 if it is not there yet.
+/// The record and the path of a result file.
+///
+/// Errors: 404 if it does not exist yet.
 pub(super) async fn result_file(
     app: &App,
     job: &Job,
@@ -158,10 +160,11 @@ pub(super) async fn result_file(
             Err(ApiError::new(Code::NotFound, NO_PREDICTION))
         }
         Err(StoreError::NotFound { .. }) => {
-            let detail = format!("{name} is not there yet; the job's state says how far it is");
+            let detail =
+                format!("{name} is not ready yet; the state of the job shows its progress");
             Err(ApiError::new(Code::NotReady, detail))
         }
-        found => Ok(found?),
+        result => Ok(result?),
     }
 }
 
@@ -176,12 +179,12 @@ pub(super) fn media_type(name: &str) -> &'static str {
     }
 }
 
-/// That a browser saves the file, and under which name.
+/// A `Content-Disposition` that has the browser save the file.
 pub(super) fn attachment(job: JobId, snapshot: Option<u32>, name: &str) -> String {
     format!("attachment; {}", file_name(job, snapshot, name))
 }
 
-/// The name under which a browser saves the file: one that tells jobs and snapshots apart.
+/// The file name in a `Content-Disposition`. It differs between jobs and between snapshots.
 pub(super) fn file_name(job: JobId, snapshot: Option<u32>, name: &str) -> String {
     let file = name.rsplit('/').next().unwrap_or(name);
     let short: String =

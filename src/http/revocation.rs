@@ -1,8 +1,8 @@
-//! Ends answers that are still being sent when the access that they began with ends: the token was revoked or has
-//! expired, the session was signed out, or a service without tokens got its first one.
+//! Aborts answers that are still being sent when their access ends: the token was revoked or has expired, the user signed
+//! out, or a service without tokens got its first token.
 //!
-//! One task asks the database on behalf of all answers. A body must not ask: nobody polls it while its client is slow,
-//! and a query that has begun keeps its connection until it is polled to its end.
+//! One task queries the database for all answers. The body of an answer must not query it: a body is not polled while its
+//! client is slow, and an unpolled query keeps its connection.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -13,10 +13,10 @@ use tokio_util::sync::CancellationToken;
 use engine::job::{Secret, TokenId};
 use store::{Store, StoreError};
 
-/// Time between two looks at the accesses that answers depend on.
-const LOOK: Duration = Duration::from_secs(3);
+/// Time between two checks of the grants.
+const INTERVAL: Duration = Duration::from_secs(3);
 
-/// The reason for which a request was let in.
+/// The reason why a request was authorized.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum Grant {
     Session(Secret),
@@ -26,7 +26,7 @@ pub(super) enum Grant {
 }
 
 impl Grant {
-    async fn holds(&self, store: &Store) -> Result<bool, StoreError> {
+    async fn is_valid(&self, store: &Store) -> Result<bool, StoreError> {
         match self {
             Self::Session(secret) => Ok(store.token_of_session(secret).await?.is_some()),
             Self::Token(id) => store.token_holds(*id).await,
@@ -35,44 +35,44 @@ impl Grant {
     }
 }
 
-/// The grants that answers depend on. Each is asked for once, however many answers there are.
+/// The grants of all answers that are being sent. Answers with the same grant share a check.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Revocations(Arc<Mutex<HashMap<Grant, Weak<CancellationToken>>>>);
 
 impl Revocations {
-    /// Begins to look. Needs a runtime of tokio.
+    /// Starts the checks. Must be called in a Tokio runtime.
     pub(super) fn start(store: Store) -> Self {
         let revocations = Self::default();
-        let looking = revocations.clone();
+        let checked = revocations.clone();
         tokio::spawn(async move {
             loop {
-                tokio::time::sleep(LOOK).await;
-                looking.look(&store).await;
+                tokio::time::sleep(INTERVAL).await;
+                checked.check(&store).await;
             }
         });
         revocations
     }
 
-    /// Waits until the grant holds no longer. Keeps no connection to the database.
+    /// Waits until the grant ends, without a connection to the database.
     pub(super) fn end_of(&self, grant: Grant) -> impl Future<Output = ()> + Send + 'static {
         let mut watched = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let place = watched.entry(grant).or_default();
-        let end = place.upgrade().unwrap_or_default();
-        *place = Arc::downgrade(&end);
+        let token = watched.entry(grant).or_default();
+        let end = token.upgrade().unwrap_or_default();
+        *token = Arc::downgrade(&end);
         async move { end.cancelled().await }
     }
 
-    async fn look(&self, store: &Store) {
+    async fn check(&self, store: &Store) {
         for (grant, end) in self.watched() {
-            // A failing database shows in every other answer, too.
-            if matches!(grant.holds(store).await, Ok(false)) {
+            // A database error does not end a grant; other requests report it.
+            if matches!(grant.is_valid(store).await, Ok(false)) {
                 self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(&grant);
                 end.cancel();
             }
         }
     }
 
-    /// The grants on which an answer still depends.
+    /// The grants of answers that are still being sent.
     fn watched(&self) -> Vec<(Grant, Arc<CancellationToken>)> {
         let mut watched = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         watched.retain(|_, end| end.strong_count() > 0);
@@ -89,7 +89,7 @@ mod tests {
     use super::{Grant, Revocations};
 
     #[tokio::test]
-    async fn answers_with_one_grant_are_asked_for_once_and_forgotten_with_the_last() {
+    async fn answers_share_the_check_of_a_grant() {
         let revocations = Revocations::default();
         let (one, other) = (revocations.end_of(Grant::Open), revocations.end_of(Grant::Open));
         let mut one = Box::pin(one);
@@ -99,7 +99,7 @@ mod tests {
         watched[0].1.cancel();
         assert!(one.now_or_never().is_some() && other.now_or_never().is_some());
         let ends = Arc::strong_count(&watched[0].1);
-        assert_eq!(ends, 1, "the answers have let go");
+        assert_eq!(ends, 1, "finished answers must release the grant");
         drop(watched);
         assert!(revocations.watched().is_empty());
     }

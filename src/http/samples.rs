@@ -1,4 +1,4 @@
-//! `/v1/samples`: a job to try the service with, of the clip that comes with the program.
+//! `/v1/samples`: creates a job of the clip that comes with the program, to try the service.
 
 use std::fs::File;
 use std::io;
@@ -51,7 +51,7 @@ pub(super) async fn create(
     headers: HeaderMap,
     Body(request): Body<SampleRequest>,
 ) -> Result<Response> {
-    // Apart from the keys with which the lab makes such things itself.
+    // The prefix keeps the key apart from keys that the lab uses on other routes.
     let key = idempotency_key(&headers)?.map(|key| format!("/v1/samples {key}"));
     let store = app.store.clone();
     let staged = intake::run(&app, &access.lab, move || simulate(&store)).await?;
@@ -62,17 +62,19 @@ pub(super) async fn create(
     }
     let [masks, data, truth] = [files[0], files[1], files[2]];
     let request_key = |file: Sha256| key.clone().map(|key| RequestKey { key, request: file });
-    // The next step needs what this one makes.
+    // Each step needs the result of the previous one, so the checks get more time than usual.
     let time = 2 * app.settings.check_time();
-    let named =
+    let calibration =
         CalibrationRequest { name: name(), masks: Some(masks), ..CalibrationRequest::default() };
-    let (named, key_of_masks) = (Submission::Calibration(named), request_key(masks));
-    let made = make(&app, &access, named, key_of_masks.as_ref(), time).await?;
-    let named = MeasurementRequest::new(name(), made.id(), data);
-    let (named, key_of_data) = (Submission::Measurement(named), request_key(data));
-    let made = make(&app, &access, named, key_of_data.as_ref(), time).await?;
+    let masks_key = request_key(masks);
+    let submission = Submission::Calibration(calibration);
+    let calibration = make(&app, &access, submission, masks_key.as_ref(), time).await?;
+    let measurement = MeasurementRequest::new(name(), calibration.id(), data);
+    let data_key = request_key(data);
+    let submission = Submission::Measurement(measurement);
+    let measurement = make(&app, &access, submission, data_key.as_ref(), time).await?;
     let job = JobRequest {
-        measurement: made.id(),
+        measurement: measurement.id(),
         calibration: None,
         snapshots: SnapshotSelection::All,
         sequence: None,
@@ -85,7 +87,7 @@ pub(super) async fn create(
     };
     let key = hashed_key(key, &job)?;
     let (status, job) = jobs::make(&app, &access, job, key).await?;
-    let location = [(header::LOCATION, job.place())];
+    let location = [(header::LOCATION, job.address())];
     let body = SampleBody { masks, data, truth, job };
     Ok((location, changed(status, &body)?).into_response())
 }
@@ -94,10 +96,10 @@ fn name() -> Option<Label> {
     "sample".parse().ok()
 }
 
-/// Files of masks, measurement and true frames. Blocks.
+/// Simulates masks, a measurement and true frames, in this order. Blocks.
 fn simulate(store: &Store) -> Result<[StagedBlob; 3]> {
     let folder = store.staged_dir()?;
-    let made = sample(folder.path())?;
+    let files = sample(folder.path())?;
     let staged = |path: &Path| -> Result<StagedBlob> {
         let mut writer = store.blob_writer()?;
         File::open(path)
@@ -105,5 +107,5 @@ fn simulate(store: &Store) -> Result<[StagedBlob; 3]> {
             .map_err(|error| ApiError::internal(&error))?;
         Ok(writer.finish()?)
     };
-    Ok([staged(&made.masks)?, staged(&made.measurement)?, staged(&made.truth)?])
+    Ok([staged(&files.masks)?, staged(&files.measurement)?, staged(&files.truth)?])
 }

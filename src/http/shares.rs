@@ -1,4 +1,4 @@
-//! Places and turns that labs share, so that none of them can take all.
+//! Limits on concurrent work that labs share, so that no lab can use all of it.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -8,8 +8,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use super::error::{ApiError, Code, Result};
 use engine::job::Lab;
 
-/// Places for what takes long. A lab has half of them at most; one that has none always gets one, also if all
-/// are taken.
+/// Places for requests that take long. A lab gets at most half of them. A lab without a place always gets one, even if
+/// all are taken.
 #[derive(Debug, Clone)]
 pub(super) struct Places {
     most: usize,
@@ -17,7 +17,7 @@ pub(super) struct Places {
     taken: Arc<Mutex<HashMap<Lab, usize>>>,
 }
 
-/// A place, until it is dropped.
+/// A place. It is free again when this is dropped.
 #[derive(Debug)]
 pub(super) struct Place {
     places: Places,
@@ -29,7 +29,7 @@ impl Places {
         Self { most, of_a_lab: most.div_ceil(2).max(1), taken: Arc::default() }
     }
 
-    /// A place for this lab; none if it has its share, or all are taken.
+    /// Takes a place for this lab. `None` if the lab has its share, or if all places are taken.
     pub(super) fn take(&self, lab: &Lab) -> Option<Place> {
         let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
         let all = taken.values().sum::<usize>();
@@ -54,8 +54,8 @@ impl Drop for Place {
     }
 }
 
-/// Work of which only so much is done at a time. Each lab has one thing in the line, so that labs take turns;
-/// its others wait behind that.
+/// A queue of work with a limit on concurrency. Each lab has one item in the queue, so that labs take turns; its other
+/// items wait for that one.
 #[derive(Debug)]
 pub(super) struct Turns {
     all: Arc<Semaphore>,
@@ -63,27 +63,31 @@ pub(super) struct Turns {
     waiting: Places,
 }
 
-/// Leave to work, until it is dropped.
+/// Permission to work. The turn ends when this is dropped.
 #[derive(Debug)]
 pub(super) struct Turn {
-    // Dropped in this order: the lab's next comes into the line when this one has left it.
+    // Fields are dropped in this order: the next item of the lab enters the queue once this one has left it.
     _all: OwnedSemaphorePermit,
     _of_lab: OwnedSemaphorePermit,
     _waiting: Place,
 }
 
 impl Turns {
-    /// So much at a time, for which so many of a lab may wait.
+    /// `at_once` items run at the same time, and `waiting` items of a lab may wait or run.
     pub(super) fn new(at_once: usize, waiting: usize) -> Self {
         let waiting = Places { most: usize::MAX, of_a_lab: waiting, taken: Arc::default() };
         Self { all: Arc::new(Semaphore::new(at_once)), of_labs: Mutex::default(), waiting }
     }
 
     /// Waits for the lab's turn.
-    /// Errors: 429 if enough of the lab's waits; 503 at the end of the service.
+    ///
+    /// Errors: 429 if too many items of the lab wait; 503 if the service stops.
     pub(super) async fn take(&self, lab: &Lab) -> Result<Turn> {
         let waiting = self.waiting.take(lab).ok_or_else(|| {
-            ApiError::new(Code::TooManyChecks, "enough files of this lab wait to be checked")
+            ApiError::new(
+                Code::TooManyChecks,
+                "too many files of this lab wait for a check; try again later",
+            )
         })?;
         let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
         let of_lab = self.of_lab(lab).acquire_owned().await.map_err(stopped)?;
@@ -116,11 +120,14 @@ mod tests {
         let places = Places::new(4);
         let (a, b, c) = (lab("a"), lab("b"), lab("c"));
         let of_a: Vec<_> = (0..3).map(|_| places.take(&a)).collect();
-        assert!(of_a[1].is_some() && of_a[2].is_none(), "half of them");
+        assert!(of_a[1].is_some() && of_a[2].is_none(), "a lab gets half of the places");
         let of_b = [places.take(&b), places.take(&b)];
         assert!(of_b.iter().all(Option::is_some));
         let of_c = [places.take(&c), places.take(&c)];
-        assert!(of_c[0].is_some() && of_c[1].is_none(), "one, though all are taken");
+        assert!(
+            of_c[0].is_some() && of_c[1].is_none(),
+            "a lab gets one place although all are taken"
+        );
         drop(of_a);
         assert!(places.take(&c).is_some());
         assert!(Places::new(1).take(&a).is_some());
@@ -142,7 +149,7 @@ mod tests {
             };
             tokio::join!(go(a.clone()), go(a.clone()), go(b.clone()), async {
                 tokio::task::yield_now().await;
-                assert!(turns.take(&a).await.is_err(), "three of a wait or work");
+                assert!(turns.take(&a).await.is_err(), "three items of lab a wait or run");
                 drop(first);
             });
             order.append(&mut done.lock().unwrap());
@@ -150,6 +157,9 @@ mod tests {
         };
         let order = line.await;
         assert_eq!(order.len(), 3);
-        assert!(order[0] == "b" || order[1] == "b", "b does not wait for all of a: {order:?}");
+        assert!(
+            order[0] == "b" || order[1] == "b",
+            "lab b does not wait for all items of lab a: {order:?}"
+        );
     }
 }

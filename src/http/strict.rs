@@ -1,12 +1,12 @@
-//! A deserializer that reads structs from objects alone.
+//! A deserializer that accepts only objects for structs.
 //!
-//! Derived implementations also read a struct from an array, field by field, which no contract describes.
+//! Derived implementations also accept an array with the fields in order, which the API description does not allow.
 
 use serde::de::{
     DeserializeSeed, Deserializer, EnumAccess, Error, MapAccess, SeqAccess, VariantAccess, Visitor,
 };
 
-/// Wraps a deserializer, or what it hands on, so that every struct inside is read from an object.
+/// Wraps a deserializer, visitor or accessor, so that every struct inside it must be an object.
 pub(super) struct Strict<T>(pub(super) T);
 
 macro_rules! forward {

@@ -1,5 +1,5 @@
-//! Requests for what is made of uploads. The check of the uploads is a task of the queue; the answer waits for it for
-//! a while.
+//! Requests for calibrations, measurements and models, which are made from uploads. A task of the queue checks the uploads;
+//! the answer waits for it for a limited time.
 
 use std::str::FromStr;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use super::error::{ApiError, Code, Problem, REQUEST_ID, Result};
 use engine::job::{CheckLimits, InvalidId, Lab, Submission, ThingId};
 use store::{Inserted, Made, NewRequest, Request, RequestKey, StoreError};
 
-/// How long a request waits for a check by default.
+/// Default time for which a request waits for a check.
 pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 
 /// State of a calibration or measurement.
@@ -41,8 +41,10 @@ pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Probl
     (Stage::Failed, Some(detail), Some(problem))
 }
 
-/// Has something made, or finds what was made with the same key. Waits so long for the check of its uploads.
-/// Errors: why the request is refused, if that is known in time; nothing of it stays on record then.
+/// Creates a resource, or returns the one that was created with the same key. Waits up to `patience` for the check of its
+/// uploads.
+///
+/// Errors: the reason of a rejection that is known in time. The rejected request is deleted then.
 pub(super) async fn make<Id>(
     app: &App,
     access: &Access,
@@ -57,30 +59,30 @@ where
     submission.check().map_err(invalid)?;
     let (lab, what) = (&access.lab, Made::of(&submission));
     loop {
-        let made = match app.store.made_with(lab, what, key).await? {
+        let inserted = match app.store.made_with(lab, what, key).await? {
             Some(id) => Inserted::Before(id),
             None => submit(app, access, &submission, key).await?,
         };
         if patience.is_zero() {
-            return Ok(made);
+            return Ok(inserted);
         }
-        let is_new = matches!(made, Inserted::New(_));
-        let thing = (what, made.id().into());
-        let waiting = settled(app.clone(), lab.clone(), thing, is_new, patience);
+        let is_new = matches!(inserted, Inserted::New(_));
+        let resource = (what, inserted.id().into());
+        let waiting = wait_for_check(app.clone(), lab.clone(), resource, is_new, patience);
         // Runs to completion even if the client disconnects.
         let waiting = match REQUEST_ID.try_with(Clone::clone) {
             Ok(id) => tokio::spawn(REQUEST_ID.scope(id, waiting)),
             Err(_) => tokio::spawn(waiting),
         };
-        let there = waiting.await.unwrap_or_else(|_| Err(StoreError::Interrupted.into()))?;
-        // A request with this key was refused meanwhile: the key is free again.
-        if there || is_new {
-            return Ok(made);
+        let exists = waiting.await.unwrap_or_else(|_| Err(StoreError::Interrupted.into()))?;
+        // If an earlier request with this key was rejected in the meantime, the key is free and the loop tries again.
+        if exists || is_new {
+            return Ok(inserted);
         }
     }
 }
 
-/// Puts a request on record, and its check in the queue.
+/// Stores a request, and adds its check to the queue.
 async fn submit<Id>(
     app: &App,
     access: &Access,
@@ -90,7 +92,7 @@ async fn submit<Id>(
 where
     Id: From<ThingId> + FromStr<Err = InvalidId>,
 {
-    vet(app, &access.lab, submission).await?;
+    check_references(app, &access.lab, submission).await?;
     let settings = &app.settings;
     let limits = CheckLimits {
         max_file_bytes: settings.max_upload_bytes,
@@ -102,10 +104,11 @@ where
     Ok(app.store.request((&access.lab, access.token), &new, key).await?)
 }
 
-/// Waits for a check. False if its request was deleted.
-/// Errors: why the uploads are refused. The HTTP request that made the record then removes it; others with the same
-/// key leave it for that one to read.
-async fn settled(
+/// Waits for a check. Returns false if the request was deleted.
+///
+/// Errors: the reason why the uploads were rejected. The HTTP request that created the record then deletes it. Repeated
+/// requests with the same key leave the record, so that the first one can read it.
+async fn wait_for_check(
     app: App,
     lab: Lab,
     (what, id): (Made, ThingId),
@@ -113,8 +116,8 @@ async fn settled(
     patience: Duration,
 ) -> Result<bool> {
     if let Err(error) = app.events.checked(&app.store, &lab, (what, id), patience).await {
-        // Enough requests of the lab wait: the answer is that the check goes on.
-        tracing::debug!(?error, "a check is not waited for");
+        // Too many requests of the lab wait. The answer then has the state `preparing`.
+        tracing::debug!(?error, "a request does not wait for its check");
     }
     let Some(request) = app.store.find_request(&lab, id).await? else { return Ok(false) };
     let Some(refusal) = request.refusal else { return Ok(true) };
@@ -124,15 +127,15 @@ async fn settled(
     Ok(app.store.find_request(&lab, id).await?.is_some())
 }
 
-/// Refuses a request that names what is not there.
-async fn vet(app: &App, lab: &Lab, submission: &Submission) -> Result<()> {
+/// Rejects a request that refers to a calibration or upload that does not exist.
+async fn check_references(app: &App, lab: &Lab, submission: &Submission) -> Result<()> {
     if let Some(calibration) = submission.calibration() {
-        let found = app.store.calibration(lab, calibration).await;
-        found.map_err(|error| ApiError::reference("/calibration", error))?;
+        let result = app.store.calibration(lab, calibration).await;
+        result.map_err(|error| ApiError::reference("/calibration", error))?;
     }
-    for (place, upload) in submission.uploads() {
-        let found = app.store.upload(lab, upload).await;
-        found.map_err(|error| ApiError::reference(&place, error))?;
+    for (pointer, upload) in submission.uploads() {
+        let result = app.store.upload(lab, upload).await;
+        result.map_err(|error| ApiError::reference(&pointer, error))?;
     }
     Ok(())
 }

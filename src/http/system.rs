@@ -1,5 +1,4 @@
-//! What the service is and how it is: `/v1/system` for people, `/livez` and `/readyz` for what watches
-//! it, `/metrics` for Prometheus.
+//! State of the service: `/v1/system` for users, `/livez` and `/readyz` for supervisors, `/metrics` for Prometheus.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -20,8 +19,8 @@ use engine::job::{JobState, TaskState, Timestamp};
 use store::{StoreError, WorkerRow};
 use strum::VariantArray;
 
-/// Time between two tries whether files can be written.
-const DISK_LOOK: Duration = Duration::from_secs(2);
+/// Time between two tests that write a file.
+const DISK_TEST_INTERVAL: Duration = Duration::from_secs(2);
 
 #[derive(Debug, Serialize, schemars::JsonSchema)]
 #[schemars(rename = "System")]
@@ -102,15 +101,15 @@ pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>> {
 }
 
 async fn jobs(app: &App) -> Result<BTreeMap<&'static str, u64>> {
-    let counted = app.store.job_counts().await?;
-    let count = |state| counted.iter().find(|(found, _)| *found == state).map_or(0, |(_, n)| *n);
+    let counts = app.store.job_counts().await?;
+    let count = |state| counts.iter().find(|(counted, _)| *counted == state).map_or(0, |(_, n)| *n);
     Ok(JobState::VARIANTS.iter().map(|&state| (state.into_str(), count(state))).collect())
 }
 
 async fn queue(app: &App) -> Result<QueueBody> {
     let tasks = app.store.task_counts().await?;
     let count = |state: TaskState| {
-        tasks.iter().filter(|((_, found), _)| *found == state).map(|(_, count)| count).sum()
+        tasks.iter().filter(|((_, counted), _)| *counted == state).map(|(_, count)| count).sum()
     };
     Ok(QueueBody {
         ready: count(TaskState::Ready),
@@ -157,14 +156,14 @@ pub(super) async fn live() -> Json<Liveness> {
     Json(Liveness { live: true })
 }
 
-/// `GET /readyz`: database, disk and workers are there. A long queue is no fault. Nor is a message server
-/// that does not answer, as long as the workers of this machine take tiles; but it is said.
+/// `GET /readyz`: the state of database, disk and workers. A long queue does not make the service unready. An unreachable
+/// message server is reported, but makes it unready only if no worker of this machine takes tiles.
 pub(super) async fn ready(State(app): State<App>) -> Response {
     let checks =
         [database_answers(&app).await, disk_takes_files(&app).await, workers_live(&app).await];
     let cluster = app.cluster.as_ref().map(|trouble| trouble.borrow().clone());
-    let tiles_go_on = matches!(cluster, None | Some(None)) || !app.settings.without_tiles();
-    let ready = checks.iter().all(Result::is_ok) && tiles_go_on;
+    let tiles_continue = matches!(cluster, None | Some(None)) || !app.settings.without_tiles();
+    let ready = checks.iter().all(Result::is_ok) && tiles_continue;
     let [database, disk, workers] =
         checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
     let status = if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
@@ -200,21 +199,24 @@ async fn database_answers(app: &App) -> Result<(), String> {
 async fn disk_takes_files(app: &App) -> Result<(), String> {
     let (free, _) = app.store.dir().disk().map_err(|_| "the disk does not answer".to_owned())?;
     if free < app.settings.min_free_bytes {
-        return Err(format!("{free} bytes are free, {} should be", app.settings.min_free_bytes));
+        return Err(format!(
+            "{free} bytes are free, but at least {} must be",
+            app.settings.min_free_bytes
+        ));
     }
-    // Anybody may ask, and a file costs a wait for the disk.
+    // Requests need no token and a test waits for the disk, so they share a recent result.
     let mut tried = app.disk_tried.lock().await;
-    if let Some((at, found)) = &*tried
-        && at.elapsed() < DISK_LOOK
+    if let Some((at, result)) = &*tried
+        && at.elapsed() < DISK_TEST_INTERVAL
     {
-        return found.clone();
+        return result.clone();
     }
-    let found = app.store.try_disk().await.map_err(|error| match error {
+    let result = app.store.try_disk().await.map_err(|error| match error {
         StoreError::Io { source, .. } => format!("no file can be written: {}", source.kind()),
         _ => "no file can be written".to_owned(),
     });
-    *tried = Some((Instant::now(), found.clone()));
-    found
+    *tried = Some((Instant::now(), result.clone()));
+    result
 }
 
 async fn workers_live(app: &App) -> Result<(), String> {
@@ -223,7 +225,7 @@ async fn workers_live(app: &App) -> Result<(), String> {
     if live == 0 { Err("no worker lives".to_owned()) } else { Ok(()) }
 }
 
-/// `GET /metrics`. What labs do is shown to those who look after all of them; to the others, of their own.
+/// `GET /metrics`. Figures of all labs are for administrators; other tokens get those of their lab.
 #[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
 pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
     for (state, count) in jobs(&app).await? {

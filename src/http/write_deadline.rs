@@ -1,7 +1,7 @@
-//! A connection that fails when its client takes too little of the answer.
+//! A connection that fails when its client reads the answer too slowly.
 //!
-//! The body of an answer is not polled while its client takes nothing, so the limit is in the connection. Time counts
-//! only while bytes wait for the client: a connection that has nothing to send lasts.
+//! The body of an answer is not polled while its client reads nothing, so the limit is in the connection. Time counts only
+//! while bytes wait for the client; an idle connection stays open.
 
 use std::io;
 use std::pin::Pin;
@@ -11,10 +11,10 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::Sleep;
 
-/// Bytes that a client must take within a time while more wait for it.
+/// The slowest allowed client: it reads `bytes` within `time` while more bytes wait.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LeastRate {
-    /// 0: no limit.
+    /// 0 stands for no limit.
     pub(super) bytes: u64,
     pub(super) time: Duration,
 }
@@ -29,8 +29,8 @@ pub(super) struct WriteDeadline<S> {
 
 #[derive(Debug)]
 struct Waiting {
-    /// Bytes that the client took since the wait began.
-    taken: u64,
+    /// Bytes that the client read since the wait began.
+    bytes_read: u64,
     deadline: Pin<Box<Sleep>>,
 }
 
@@ -39,8 +39,9 @@ impl<S> WriteDeadline<S> {
         Self { stream, least, waiting: None }
     }
 
-    /// Notes what came of a write.
-    /// Errors: `TimedOut` if the client took too little since its wait began.
+    /// Updates the wait after a write.
+    ///
+    /// Errors: `TimedOut` if the client read too little since the wait began.
     fn check(
         &mut self,
         cx: &mut Context<'_>,
@@ -50,18 +51,23 @@ impl<S> WriteDeadline<S> {
         match &written {
             Poll::Ready(Ok(count)) => {
                 if let Some(waiting) = &mut self.waiting {
-                    waiting.taken += *count as u64;
-                    if waiting.taken >= bytes {
+                    waiting.bytes_read += *count as u64;
+                    if waiting.bytes_read >= bytes {
                         self.waiting = None;
                     }
                 }
             }
             Poll::Pending if bytes > 0 => {
-                let begun = || Waiting { taken: 0, deadline: Box::pin(tokio::time::sleep(time)) };
-                let waiting = self.waiting.get_or_insert_with(begun);
+                let start =
+                    || Waiting { bytes_read: 0, deadline: Box::pin(tokio::time::sleep(time)) };
+                let waiting = self.waiting.get_or_insert_with(start);
                 if waiting.deadline.as_mut().poll(cx).is_ready() {
-                    let (taken, seconds) = (waiting.taken, time.as_secs());
-                    tracing::info!(taken, seconds, "an answer was broken off: its client is slow");
+                    let (bytes_read, seconds) = (waiting.bytes_read, time.as_secs());
+                    tracing::info!(
+                        bytes_read,
+                        seconds,
+                        "an answer was aborted because its client reads too slowly"
+                    );
                     return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
                 }
             }
@@ -94,7 +100,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for WriteDeadline<S> {
         self.stream.is_write_vectored()
     }
 
-    /// Called when all bytes have been written: nothing waits for the client any more.
+    /// Ends the wait: once all bytes are flushed, none wait for the client.
     fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         let flushed = Pin::new(&mut self.stream).poll_flush(cx);
         if flushed.is_ready() {
@@ -134,8 +140,8 @@ mod tests {
     async fn send_to_client(bytes: usize, least: LeastRate) -> (std::io::Result<()>, Duration) {
         let (stream, mut client) = duplex(1000);
         let reading = tokio::spawn(async move {
-            let mut piece = vec![0; bytes];
-            while client.read_exact(&mut piece).await.is_ok() {
+            let mut buffer = vec![0; bytes];
+            while client.read_exact(&mut buffer).await.is_ok() {
                 sleep(Duration::from_millis(50)).await;
             }
         });
@@ -147,32 +153,32 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_client_below_the_rate_is_broken_off_after_the_time() {
+    async fn an_answer_to_a_slow_client_is_aborted() {
         let (sent, took) = send_to_client(50, SECOND).await;
         assert_eq!(sent.unwrap_err().kind(), ErrorKind::TimedOut);
         assert!((1.0..2.0).contains(&took.as_secs_f64()), "{took:?}");
         let (sent, took) = send_to_client(1000, SECOND).await;
         sent.unwrap();
-        assert!(took > 2 * SECOND.time, "it took several of these times: {took:?}");
+        assert!(took > 2 * SECOND.time, "several periods passed: {took:?}");
         let (sent, _) = send_to_client(1000, LeastRate { bytes: 0, ..SECOND }).await;
         sent.unwrap();
     }
 
     #[tokio::test]
-    async fn time_without_an_answer_does_not_count() {
+    async fn idle_time_does_not_count() {
         let (stream, mut client) = duplex(1000);
         let mut stream = WriteDeadline::new(stream, SECOND);
         for _ in 0..3 {
-            // Longer than the buffer, so that it waits for the client.
+            // The answer exceeds the buffer, so bytes wait for the client.
             let answer = async {
                 stream.write_all(&[1; 1500]).await.unwrap();
                 stream.flush().await.unwrap();
             };
-            let taken = async {
+            let read = async {
                 sleep(Duration::from_millis(50)).await;
                 client.read_exact(&mut [0; 1500]).await.unwrap();
             };
-            tokio::join!(answer, taken);
+            tokio::join!(answer, read);
             sleep(Duration::from_millis(700)).await;
         }
         let error = stream.write_all(&[1; 1500]).await.unwrap_err();

@@ -1,5 +1,5 @@
-//! `results.zip`: all that a job has made, stored and not compressed. Its layout follows from names and sizes
-//! alone, so that any range of it can be made by itself; the `zip` crate writes from the front to the end.
+//! `results.zip`: all result files of a job, without compression. The layout depends only on names and sizes, so any
+//! range can be composed separately. The crate `zip` can only write an archive from its beginning to its end.
 
 use std::sync::Arc;
 
@@ -9,102 +9,104 @@ use axum::response::Response;
 use super::super::error::Result;
 use super::super::results::{attachment, result_file};
 use super::clip::Clip;
-use super::composed::{Composed, Framing, Part, Piece};
+use super::composed::{Composed, Framing, Part, Section, Source};
 
-/// 45 stands for version 4.5, the first with files above 4 GiB.
+/// Version 4.5 of the specification (APPNOTE 4.4.3), the first with files above 4 GiB.
 const VERSION: u16 = 45;
-/// In the field of 32 bits: the number stands in the extra field, in 64.
-const ELSEWHERE: u32 = u32::MAX;
-/// 1 January 1980: the archive is made of the results alone.
+/// Value of a 32-bit field whose number is in the ZIP64 extra field.
+const IN_EXTRA_FIELD: u32 = u32::MAX;
+/// 1 January 1980, the zero of the format. The time of the request must not change the bytes.
 const DATE: u16 = 0x21;
-/// Names are UTF-8.
+/// Bit 11: names are UTF-8.
 const FLAGS: u16 = 1 << 11;
+// Signatures of the records.
 const LOCAL: u32 = 0x0403_4b50;
 const CENTRAL: u32 = 0x0201_4b50;
 const END: u32 = 0x0605_4b50;
 const END_64: u32 = 0x0606_4b50;
 const LOCATOR_64: u32 = 0x0706_4b50;
 
-/// `zip` of a job.
+/// `zip`: an archive of all results of a job.
 pub(super) async fn archive(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let Clip { app, job, .. } = clip;
-    // The last file that a job makes.
+    // A job writes the manifest last: if it is missing, the results are incomplete.
     let (manifest, _) = result_file(&app, &job, None, "manifest.json").await?;
     let mut members = Vec::new();
     for snapshot in job.spec.snapshots.indices() {
         for file in app.store.result_files(&job, Some(snapshot)).await? {
             let name = format!("snapshot_{snapshot:04}/{}", file.name);
-            members.push((name, Piece { snapshot: Some(snapshot), file }));
+            members.push((name, Source { snapshot: Some(snapshot), file }));
         }
     }
-    members.push((manifest.name.clone(), Piece { snapshot: None, file: manifest }));
+    members.push((manifest.name.clone(), Source { snapshot: None, file: manifest }));
     let disposition = attachment(job.id, None, "results.zip");
     let composed = Composed { parts: parts(members), kind: "application/zip", disposition };
     composed.send(&app, job, request).await
 }
 
-/// A file of the archive and where it begins.
+/// A file of the archive.
 #[derive(Debug, Clone)]
 struct Member {
     name: String,
     size: u64,
-    at: u64,
+    /// Offset of its local header in the archive.
+    offset: u64,
 }
 
-/// The archive of these files.
-fn parts(files: Vec<(String, Piece)>) -> Vec<Part> {
+/// Lays out an archive of these files.
+fn parts(files: Vec<(String, Source)>) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut members = Vec::new();
-    let mut at = 0;
-    let pieces: Arc<[Piece]> = files.iter().map(|(_, piece)| piece.clone()).collect();
-    for (name, piece) in files {
-        let size = piece.file.size;
-        let member = Member { name, size, at };
-        let length = member.local(0).len() as u64;
-        at += length + size;
+    let mut offset = 0;
+    let sources: Arc<[Source]> = files.iter().map(|(_, source)| source.clone()).collect();
+    for (name, source) in files {
+        let size = source.file.size;
+        let member = Member { name, size, offset };
+        let length = member.local_header(0).len() as u64;
+        offset += length + size;
         members.push(member.clone());
-        let make: Framing = Arc::new(move |sums: &[u32]| member.local(sums[0]));
-        parts.push(Part::Framing { pieces: [piece.clone()].into(), length, make });
-        parts.push(Part::File { piece, start: 0, length: size });
+        let make: Framing = Arc::new(move |sums: &[u32]| member.local_header(sums[0]));
+        parts.push(Part::Framing { sources: [source.clone()].into(), length, make });
+        parts.push(Part::File(Section { source, start: 0, length: size }));
     }
-    let length = directory(&members, &vec![0; members.len()], at).len() as u64;
-    let make: Framing = Arc::new(move |sums: &[u32]| directory(&members, sums, at));
-    parts.push(Part::Framing { pieces, length, make });
+    let length = directory(&members, &vec![0; members.len()], offset).len() as u64;
+    let make: Framing = Arc::new(move |sums: &[u32]| directory(&members, sums, offset));
+    parts.push(Part::Framing { sources, length, make });
     parts
 }
 
 impl Member {
-    /// The header before its bytes.
-    fn local(&self, crc32: u32) -> Vec<u8> {
-        let extra = extra(&[self.size, self.size]);
+    /// The header before the bytes of the file.
+    fn local_header(&self, crc32: u32) -> Vec<u8> {
+        let extra = zip64_extra(&[self.size, self.size]);
         let mut bytes = Vec::new();
         bytes.extend(LOCAL.to_le_bytes());
-        self.common(&mut bytes, crc32, &extra);
+        self.push_common_fields(&mut bytes, crc32, &extra);
         bytes.extend(self.name.as_bytes());
         bytes.extend(extra);
         bytes
     }
 
-    /// Its entry in the directory.
-    fn central(&self, crc32: u32, bytes: &mut Vec<u8>) {
-        let extra = extra(&[self.size, self.size, self.at]);
+    /// Appends the entry of the file in the central directory.
+    fn push_central_header(&self, crc32: u32, bytes: &mut Vec<u8>) {
+        let extra = zip64_extra(&[self.size, self.size, self.offset]);
         bytes.extend(CENTRAL.to_le_bytes());
-        // Made on Unix, for its modes.
+        // Created on Unix (3), so that readers use the file mode.
         bytes.extend((3 << 8 | VERSION).to_le_bytes());
-        self.common(bytes, crc32, &extra);
-        // No comment, first disk, no attributes inside.
+        self.push_common_fields(bytes, crc32, &extra);
+        // No comment, disk number 0, no internal attributes.
         bytes.extend([0; 6]);
-        // A regular file that all may read.
+        // A regular file with mode 0644.
         bytes.extend((0o100_644_u32 << 16).to_le_bytes());
-        bytes.extend(short(self.at).to_le_bytes());
+        bytes.extend(field_32(self.offset).to_le_bytes());
         bytes.extend(self.name.as_bytes());
         bytes.extend(extra);
     }
 
-    /// What both have: from the version to the length of the extra field.
-    fn common(&self, bytes: &mut Vec<u8>, crc32: u32, extra: &[u8]) {
-        let size = short(self.size).to_le_bytes();
-        // Method 0 is stored; midnight.
+    /// Appends the fields of both headers, from the version to the length of the extra field.
+    fn push_common_fields(&self, bytes: &mut Vec<u8>, crc32: u32, extra: &[u8]) {
+        let size = field_32(self.size).to_le_bytes();
+        // Method 0 means no compression. Time 0 is midnight.
         for field in [VERSION, FLAGS, 0, 0, DATE] {
             bytes.extend(field.to_le_bytes());
         }
@@ -116,14 +118,14 @@ impl Member {
     }
 }
 
-/// A number in a field of 32 bits.
-fn short(number: u64) -> u32 {
-    u32::try_from(number).unwrap_or(ELSEWHERE)
+/// Value of a 32-bit field for a number.
+fn field_32(number: u64) -> u32 {
+    u32::try_from(number).unwrap_or(IN_EXTRA_FIELD)
 }
 
-/// The field for numbers of which another field says that they stand elsewhere.
-fn extra(numbers: &[u64]) -> Vec<u8> {
-    let large = numbers.iter().filter(|number| short(**number) == ELSEWHERE);
+/// The ZIP64 extra field with those numbers that do not fit into 32 bits. Empty if all fit.
+fn zip64_extra(numbers: &[u64]) -> Vec<u8> {
+    let large = numbers.iter().filter(|number| field_32(**number) == IN_EXTRA_FIELD);
     let numbers: Vec<u8> = large.flat_map(|number| number.to_le_bytes()).collect();
     if numbers.is_empty() {
         return numbers;
@@ -134,23 +136,25 @@ fn extra(numbers: &[u64]) -> Vec<u8> {
     field
 }
 
-/// The directory, which begins at this place, and the end.
-fn directory(members: &[Member], sums: &[u32], at: u64) -> Vec<u8> {
+/// The central directory at this offset, and the records at the end of the archive.
+fn directory(members: &[Member], sums: &[u32], offset: u64) -> Vec<u8> {
     let mut bytes = Vec::new();
     for (member, crc32) in members.iter().zip(sums) {
-        member.central(*crc32, &mut bytes);
+        member.push_central_header(*crc32, &mut bytes);
     }
     let (count, size) = (members.len() as u64, bytes.len() as u64);
-    let few = u16::try_from(count).unwrap_or(u16::MAX);
-    if few == u16::MAX || short(size) == ELSEWHERE || short(at) == ELSEWHERE {
-        let end = at + size;
+    let count_16 = u16::try_from(count).unwrap_or(u16::MAX);
+    let is_zip64 =
+        count_16 == u16::MAX || [size, offset].into_iter().any(|n| field_32(n) == IN_EXTRA_FIELD);
+    if is_zip64 {
+        let end = offset + size;
         bytes.extend(END_64.to_le_bytes());
-        // Bytes of the record behind this field.
+        // Length of the rest of the record.
         bytes.extend(44_u64.to_le_bytes());
         bytes.extend(VERSION.to_le_bytes());
         bytes.extend(VERSION.to_le_bytes());
         bytes.extend([0; 8]);
-        for number in [count, count, size, at] {
+        for number in [count, count, size, offset] {
             bytes.extend(number.to_le_bytes());
         }
         bytes.extend(LOCATOR_64.to_le_bytes());
@@ -160,10 +164,10 @@ fn directory(members: &[Member], sums: &[u32], at: u64) -> Vec<u8> {
     }
     bytes.extend(END.to_le_bytes());
     bytes.extend([0; 4]);
-    bytes.extend(few.to_le_bytes());
-    bytes.extend(few.to_le_bytes());
-    bytes.extend(short(size).to_le_bytes());
-    bytes.extend(short(at).to_le_bytes());
+    bytes.extend(count_16.to_le_bytes());
+    bytes.extend(count_16.to_le_bytes());
+    bytes.extend(field_32(size).to_le_bytes());
+    bytes.extend(field_32(offset).to_le_bytes());
     bytes.extend([0; 2]);
     bytes
 }
@@ -174,81 +178,81 @@ mod tests {
 
     use flate2::Crc;
 
-    use super::{Part, Piece, parts};
+    use super::{Part, Source, parts};
     use engine::job::{ResultFile, Sha256};
 
-    fn files(sizes: &[u64]) -> Vec<(String, Piece)> {
+    fn files(sizes: &[u64]) -> Vec<(String, Source)> {
         let file = |(index, size): (usize, &u64)| {
             let name = format!("file_{index}");
             let file = ResultFile { name: name.clone(), size: *size, sha256: Sha256::of(b"") };
-            (name, Piece { snapshot: None, file })
+            (name, Source { snapshot: None, file })
         };
         sizes.iter().enumerate().map(file).collect()
     }
 
-    /// The archive of files of zeros, as something to read: where each part begins, and its bytes if they are
-    /// no zeros.
-    struct Zeros {
+    /// A reader of an archive of files that contain only zeros.
+    struct ArchiveOfZeros {
+        /// The offset of each part, and its bytes. `None` for a file of zeros.
         parts: Vec<(u64, Option<Vec<u8>>)>,
         length: u64,
-        at: u64,
+        position: u64,
     }
 
-    impl Zeros {
+    impl ArchiveOfZeros {
         fn new(sizes: &[u64]) -> Self {
-            let (mut length, mut found) = (0, Vec::new());
+            let (mut length, mut placed) = (0, Vec::new());
             for part in parts(files(sizes)) {
                 let bytes = match &part {
-                    Part::Framing { pieces, make, .. } => {
-                        let sums = pieces.iter().map(|piece| crc(piece.file.size));
+                    Part::Framing { sources, make, .. } => {
+                        let sums = sources.iter().map(|source| crc(source.file.size));
                         Some(make(&sums.collect::<Vec<_>>()))
                     }
                     _ => None,
                 };
-                found.push((length, bytes));
+                placed.push((length, bytes));
                 length += part.length();
             }
-            Self { parts: found, length, at: 0 }
+            Self { parts: placed, length, position: 0 }
         }
     }
 
     fn crc(size: u64) -> u32 {
-        // Only small files are read.
+        // The test reads only small files.
         let mut crc = Crc::new();
         crc.update(&vec![0; if size < 1000 { size as usize } else { 0 }]);
         crc.sum()
     }
 
-    impl Read for Zeros {
+    impl Read for ArchiveOfZeros {
         fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-            if self.at >= self.length {
+            if self.position >= self.length {
                 return Ok(0);
             }
-            let next = self.parts.partition_point(|(begin, _)| *begin <= self.at);
-            let end = self.parts.get(next).map_or(self.length, |(begin, _)| *begin);
-            let (begin, bytes) = &self.parts[next - 1];
-            let count = buffer.len().min((end - self.at) as usize);
+            let next = self.parts.partition_point(|(start, _)| *start <= self.position);
+            let end = self.parts.get(next).map_or(self.length, |(start, _)| *start);
+            let (start, bytes) = &self.parts[next - 1];
+            let count = buffer.len().min((end - self.position) as usize);
             match bytes {
                 Some(bytes) => {
-                    let skip = (self.at - begin) as usize;
+                    let skip = (self.position - start) as usize;
                     buffer[..count].copy_from_slice(&bytes[skip..skip + count]);
                 }
                 None => buffer[..count].fill(0),
             }
-            self.at += count as u64;
+            self.position += count as u64;
             Ok(count)
         }
     }
 
-    impl Seek for Zeros {
+    impl Seek for ArchiveOfZeros {
         fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
-            let base = |base: u64, by: i64| base.checked_add_signed(by).unwrap();
-            self.at = match to {
-                SeekFrom::Start(at) => at,
-                SeekFrom::End(by) => base(self.length, by),
-                SeekFrom::Current(by) => base(self.at, by),
+            let shifted = |base: u64, by: i64| base.checked_add_signed(by).unwrap();
+            self.position = match to {
+                SeekFrom::Start(position) => position,
+                SeekFrom::End(by) => shifted(self.length, by),
+                SeekFrom::Current(by) => shifted(self.position, by),
             };
-            Ok(self.at)
+            Ok(self.position)
         }
     }
 
@@ -256,7 +260,7 @@ mod tests {
     fn another_reader_finds_files_beyond_4_gib_and_beyond_65535() {
         let many = vec![1; 70_000];
         for sizes in [&[7, 0, 12][..], &[10, 5 << 30, 20, u64::from(u32::MAX), 30], &many] {
-            let mut archive = zip::ZipArchive::new(Zeros::new(sizes)).unwrap();
+            let mut archive = zip::ZipArchive::new(ArchiveOfZeros::new(sizes)).unwrap();
             assert_eq!(archive.len(), sizes.len());
             let step = sizes.len().div_ceil(10);
             for (index, size) in sizes.iter().enumerate().step_by(step) {

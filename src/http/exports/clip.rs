@@ -1,5 +1,5 @@
-//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, array and Zarr: views onto the raw frames
-//! of `frames.npy`.
+//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, NPY and Zarr. These exports are composed of
+//! the raw frames in `frames.npy`.
 
 use axum::body::Bytes;
 use axum::extract::FromRequestParts;
@@ -12,10 +12,10 @@ use serde_json::json;
 use super::super::app::App;
 use super::super::conditional;
 use super::super::error::{ApiError, Code, Result};
-use super::super::extract::{Caller, Params};
+use super::super::extract::{Caller, Params, canonical_number};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, result_file};
-use super::composed::{Composed, Part, Piece};
+use super::composed::{Composed, Part, Section, Source};
 use super::format::Format;
 use engine::job::JobId;
 use engine::pipeline::manifest::CameraRecord;
@@ -28,13 +28,13 @@ const ARRAY: &str = "frames.npy";
 pub(in crate::http) struct Clip {
     pub(super) app: App,
     pub(super) job: Job,
-    /// None for all snapshots of the job.
+    /// The index of a snapshot; `None` stands for all snapshots of the job.
     pub(super) snapshot: Option<u32>,
     pub(super) format: Format,
 }
 
 #[derive(Deserialize)]
-struct Place {
+struct ClipPath {
     job: JobId,
     snapshot: Option<u32>,
     format: Format,
@@ -45,8 +45,8 @@ impl FromRequestParts<App> for Clip {
 
     async fn from_request_parts(parts: &mut Parts, app: &App) -> Result<Self> {
         let Caller(app, access) = Caller::from_request_parts(parts, app).await?;
-        let place = Params::from_request_parts(parts, &app).await?;
-        let Params(Place { job, snapshot, format }) = place;
+        let params = Params::from_request_parts(parts, &app).await?;
+        let Params(ClipPath { job, snapshot, format }) = params;
         let job = match snapshot {
             Some(snapshot) => with_snapshot(&app, &access.lab, job, snapshot).await?,
             None => app.store.job(&access.lab, job).await?,
@@ -55,7 +55,7 @@ impl FromRequestParts<App> for Clip {
     }
 }
 
-/// `tiff`: a BigTIFF with the descriptions of OME and ImageJ.
+/// `tiff`: a BigTIFF with OME-XML and an ImageJ description.
 pub(super) async fn tiff(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let times = clip.times().await?;
     let name = clip.snapshot.map_or(String::new(), |snapshot| format!(" snapshot {snapshot}"));
@@ -66,56 +66,54 @@ pub(super) async fn tiff(clip: Clip, request: (&Method, &HeaderMap)) -> Result<R
         interval_s: times.interval_s,
         times_s: times.starts_s.as_deref(),
     });
-    clip.behind(head, "image/tiff", "stack.tif", request).await
+    clip.send_with_head(head, "image/tiff", "stack.tif", request).await
 }
 
-/// `npy` of all snapshots.
+/// `npy`: the frames of all snapshots as one array.
 pub(super) async fn array(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let head = npy::stack_header(clip.shape(), clip.channels());
-    clip.behind(head, "application/octet-stream", ARRAY, request).await
+    clip.send_with_head(head, "application/octet-stream", ARRAY, request).await
 }
 
-/// `zarr/zarr.json` and `zarr/c/FRAME/0/0`, for colours `zarr/c/FRAME/0/0/0`: a chunk is a frame, counted from 0.
+/// `zarr/zarr.json`, and the chunks `zarr/c/FRAME/0/0`, or `zarr/c/FRAME/0/0/0` for colours. A chunk is a frame, counted
+/// from 0.
 pub(super) async fn zarr(
     clip: Clip,
     path: &str,
     request: (&Method, &HeaderMap),
 ) -> Result<Response> {
     if path == "zarr.json" {
-        return describe(clip, request.1).await;
+        return zarr_json(clip, request.1).await;
     }
     let (frames, ..) = clip.shape();
-    let end = if clip.channels() == Channels::Rgb { "/0/0/0" } else { "/0/0" };
-    let number = path.strip_prefix("c/").and_then(|rest| rest.strip_suffix(end));
-    let frame = number.and_then(plain).filter(|frame| *frame < frames);
+    let suffix = if clip.channels() == Channels::Rgb { "/0/0/0" } else { "/0/0" };
+    let number = path.strip_prefix("c/").and_then(|rest| rest.strip_suffix(suffix));
+    let frame = number.and_then(canonical_number).filter(|frame| *frame < frames);
     let frame = frame.ok_or_else(|| {
-        let detail =
-            format!("the array has zarr.json and the chunks c/0{end} to c/{}{end}", frames - 1);
+        let detail = format!(
+            "the array has zarr.json and the chunks c/0{suffix} to c/{}{suffix}",
+            frames - 1
+        );
         ApiError::new(Code::NotFound, detail)
     })?;
-    let each = clip.job.spec.shape.frames;
+    let per_snapshot = clip.job.spec.shape.frames;
     let first = clip.snapshot.unwrap_or(clip.job.spec.snapshots.first);
-    let snapshot = first + u32::try_from(frame / each).unwrap_or(u32::MAX);
-    let piece = clip.piece(snapshot).await?;
-    let bytes = clip.frame_bytes();
-    let start = clip.start(&piece)? + (frame % each) as u64 * bytes;
+    let snapshot = first + u32::try_from(frame / per_snapshot).unwrap_or(u32::MAX);
+    let source = clip.source(snapshot).await?;
+    let length = clip.frame_bytes();
+    let start = clip.start(&source)? + (frame % per_snapshot) as u64 * length;
     let composed = Composed {
-        parts: vec![Part::File { piece, start, length: bytes }],
+        parts: vec![Part::File(Section { source, start, length })],
         kind: "application/octet-stream",
         disposition: "inline".into(),
     };
     composed.send(&clip.app, clip.job, request).await
 }
 
-/// A number in the one form in which it is written.
-pub(super) fn plain(text: &str) -> Option<usize> {
-    text.parse().ok().filter(|number: &usize| number.to_string() == text)
-}
-
-/// `zarr.json`.
-async fn describe(clip: Clip, headers: &HeaderMap) -> Result<Response> {
-    // A missing chunk is read as zeros, so the array is announced once all chunks exist.
-    clip.pieces().await?;
+/// `zarr.json`: the metadata of the array.
+async fn zarr_json(clip: Clip, headers: &HeaderMap) -> Result<Response> {
+    // Readers take a missing chunk for zeros, so the metadata exist only once all chunks do.
+    clip.sources().await?;
     let (frames, height, width) = clip.shape();
     let times = clip.times().await?;
     let (mut shape, mut names) = (vec![frames, height, width], vec!["frame", "row", "column"]);
@@ -146,9 +144,11 @@ async fn describe(clip: Clip, headers: &HeaderMap) -> Result<Response> {
     conditional::json(&array, headers)
 }
 
-/// When frames were taken, as far as it is known.
+/// Times of the frames in seconds.
 struct Times {
+    /// `None` if it is unknown, or not the same between all frames.
     interval_s: Option<f64>,
+    /// Start of each frame; `None` if unknown.
     starts_s: Option<Vec<f64>>,
 }
 
@@ -160,7 +160,7 @@ impl Clip {
         }
     }
 
-    /// Frames, rows, columns.
+    /// Numbers of frames, rows and columns.
     fn shape(&self) -> (usize, usize, usize) {
         let shape = self.job.spec.shape;
         (self.snapshots().len() * shape.frames, shape.height, shape.width)
@@ -176,26 +176,26 @@ impl Clip {
     }
 
     /// The raw frames of a snapshot.
-    async fn piece(&self, snapshot: u32) -> Result<Piece> {
+    async fn source(&self, snapshot: u32) -> Result<Source> {
         let (file, _) = result_file(&self.app, &self.job, Some(snapshot), ARRAY).await?;
-        Ok(Piece { snapshot: Some(snapshot), file })
+        Ok(Source { snapshot: Some(snapshot), file })
     }
 
-    pub(super) async fn pieces(&self) -> Result<Vec<Piece>> {
-        let mut pieces = Vec::new();
+    pub(super) async fn sources(&self) -> Result<Vec<Source>> {
+        let mut sources = Vec::new();
         for snapshot in self.snapshots() {
-            pieces.push(self.piece(snapshot).await?);
+            sources.push(self.source(snapshot).await?);
         }
-        Ok(pieces)
+        Ok(sources)
     }
 
-    /// Where the frames of a snapshot begin in its file: behind its header.
-    fn start(&self, piece: &Piece) -> Result<u64> {
-        behind_header(piece, self.job.spec.shape.frames as u64 * self.frame_bytes())
+    /// Offset of the frames in the file of a snapshot.
+    fn start(&self, source: &Source) -> Result<u64> {
+        values_offset(source, self.job.spec.shape.frames as u64 * self.frame_bytes())
     }
 
-    /// Answers with these bytes and all frames behind them.
-    async fn behind(
+    /// Answers with a file of these first bytes and all frames.
+    async fn send_with_head(
         self,
         head: Vec<u8>,
         kind: &'static str,
@@ -203,10 +203,10 @@ impl Clip {
         request: (&Method, &HeaderMap),
     ) -> Result<Response> {
         let mut parts = vec![Part::Bytes(Bytes::from(head))];
-        for piece in self.pieces().await? {
-            let start = self.start(&piece)?;
-            let length = piece.file.size - start;
-            parts.push(Part::File { piece, start, length });
+        for source in self.sources().await? {
+            let start = self.start(&source)?;
+            let length = source.file.size - start;
+            parts.push(Part::File(Section { source, start, length }));
         }
         let disposition = attachment(self.job.id, self.snapshot, name);
         Composed { parts, kind, disposition }.send(&self.app, self.job, request).await
@@ -226,10 +226,10 @@ impl Clip {
             let starts = records.iter().map(|record| record.frame_times_s.clone());
             let starts_s: Option<Vec<f64>> =
                 starts.collect::<Option<Vec<_>>>().map(|all| all.concat());
-            let each = records.first().and_then(|record| record.frame_exposure_s(frames));
-            let interval_s = each.filter(|each| match (&starts_s, records.len()) {
+            let exposure = records.first().and_then(|record| record.frame_exposure_s(frames));
+            let interval_s = exposure.filter(|exposure| match (&starts_s, records.len()) {
                 (_, 1) => true,
-                (Some(starts), _) => is_even(starts, *each),
+                (Some(starts), _) => is_regular(starts, *exposure),
                 (None, _) => false,
             });
             Times { interval_s, starts_s }
@@ -237,14 +237,14 @@ impl Clip {
     }
 }
 
-/// Where the values of an array begin, which end its file and have so many bytes.
-pub(super) fn behind_header(piece: &Piece, values: u64) -> Result<u64> {
-    piece.file.size.checked_sub(values).ok_or_else(|| {
+/// Offset of the values in the file of an array. `values` is their length in bytes; they end the file.
+pub(super) fn values_offset(source: &Source, values: u64) -> Result<u64> {
+    source.file.size.checked_sub(values).ok_or_else(|| {
         ApiError::internal(&std::io::Error::other("an array has fewer frames than its job"))
     })
 }
 
-/// True if frames follow one another at this interval, without a pause.
-fn is_even(starts: &[f64], interval: f64) -> bool {
+/// True if all frames follow each other at this interval, within 0.1 %.
+fn is_regular(starts: &[f64], interval: f64) -> bool {
     starts.windows(2).all(|pair| ((pair[1] - pair[0]) / interval - 1.0).abs() < 1e-3)
 }

@@ -1,5 +1,5 @@
-//! A file that lies nowhere: it is put together, as it is read, of result files and of the bytes between
-//! them. What a byte of it is follows from the results alone, so that a download can go on where it was cut.
+//! Files that are composed of result files while a client reads them, and are never stored. Their bytes depend only on
+//! the results, so a client can resume a download that broke off.
 
 use std::fmt;
 use std::io;
@@ -21,35 +21,38 @@ use super::lines::Lines;
 use engine::job::{ResultFile, Sha256};
 use store::{Job, StoreError};
 
-/// A result file of a snapshot, or of the whole job.
+/// A result file that an export reads. `snapshot` is `None` for a file of the whole job.
 #[derive(Debug, Clone)]
-pub(super) struct Piece {
+pub(super) struct Source {
     pub(super) snapshot: Option<u32>,
     pub(super) file: ResultFile,
 }
 
-/// What stands between result files and needs their check sums.
+/// A range of bytes of a result file.
+#[derive(Debug, Clone)]
+pub(super) struct Section {
+    pub(super) source: Source,
+    pub(super) start: u64,
+    pub(super) length: u64,
+}
+
+/// Composes the bytes between result files, such as headers of an archive, from the CRC-32 of the files.
 pub(super) type Framing = Arc<dyn Fn(&[u32]) -> Vec<u8> + Send + Sync>;
 
 #[derive(Clone)]
 pub(super) enum Part {
     Bytes(Bytes),
-    /// Bytes of a result file.
-    File {
-        piece: Piece,
-        start: u64,
-        length: u64,
-    },
-    /// So many bytes, which follow from the CRC-32 of these files.
+    File(Section),
+    /// `length` bytes, which `make` composes from the CRC-32 of the sources.
     Framing {
-        pieces: Arc<[Piece]>,
+        sources: Arc<[Source]>,
         length: u64,
         make: Framing,
     },
-    /// Lines that are made of those of a result file, and of bytes of another one: where they begin, and how many.
+    /// Lines of a result file, each composed with bytes that all lines share.
     Lines {
-        piece: Piece,
-        shared: (Piece, u64, u64),
+        source: Source,
+        shared: Section,
         lines: Lines,
     },
 }
@@ -64,101 +67,107 @@ impl Part {
     pub(super) fn length(&self) -> u64 {
         match self {
             Self::Bytes(bytes) => bytes.len() as u64,
-            Self::File { length, .. } | Self::Framing { length, .. } => *length,
+            Self::File(section) => section.length,
+            Self::Framing { length, .. } => *length,
             Self::Lines { lines, .. } => lines.length(),
         }
     }
 
-    /// The result files whose bytes are in it.
-    fn pieces(&self) -> Vec<&Piece> {
+    /// The result files whose bytes are in the part.
+    fn sources(&self) -> Vec<&Source> {
         match self {
             Self::Bytes(_) | Self::Framing { .. } => Vec::new(),
-            Self::File { piece, .. } => vec![piece],
-            Self::Lines { piece, shared: (shared, ..), .. } => vec![piece, shared],
+            Self::File(section) => vec![&section.source],
+            Self::Lines { source, shared, .. } => vec![source, &shared.source],
         }
     }
 
-    /// Adds to a hash what the bytes follow from.
-    fn describe(&self, hasher: &mut sha2::Sha256) {
+    /// Adds everything that determines the bytes to a hash.
+    fn hash_inputs(&self, hasher: &mut sha2::Sha256) {
         match self {
             Self::Bytes(bytes) => {
                 hasher.update(format!("bytes {}\n", bytes.len()));
                 hasher.update(bytes);
             }
-            Self::File { piece, start, length } => {
-                hasher.update(format!("{start} {length} {}\n", piece.file.sha256));
-            }
-            Self::Framing { pieces, length, .. } => {
+            Self::File(section) => section.hash_inputs(hasher),
+            Self::Framing { sources, length, .. } => {
                 hasher.update(format!("framing {length}\n"));
-                pieces.iter().for_each(|piece| hasher.update(format!("{}\n", piece.file.sha256)));
+                sources
+                    .iter()
+                    .for_each(|source| hasher.update(format!("{}\n", source.file.sha256)));
             }
-            Self::Lines { piece, shared: (shared, start, length), lines } => {
-                hasher.update(format!("{lines:?} {} {}\n", lines.start, piece.file.sha256));
-                hasher.update(format!("{start} {length} {}\n", shared.file.sha256));
+            Self::Lines { source, shared, lines } => {
+                hasher.update(format!("{lines:?} {} {}\n", lines.start, source.file.sha256));
+                shared.hash_inputs(hasher);
             }
         }
     }
 
-    /// The bytes from `skip` on, `take` of them.
-    async fn read(self, app: App, job: Arc<Job>, skip: u64, take: u64) -> io::Result<Bytewise> {
+    /// Reads `take` bytes of the part after the first `skip` bytes.
+    async fn read(self, app: App, job: Arc<Job>, skip: u64, take: u64) -> io::Result<ByteStream> {
         match self {
-            Self::Bytes(bytes) => Ok(once(&bytes, skip, take)),
-            Self::File { piece, start, .. } => {
-                Ok(part(&app, &job, (&piece, start + skip, take)).await?.boxed())
+            Self::Bytes(bytes) => Ok(slice_stream(&bytes, skip, take)),
+            Self::File(Section { source, start, .. }) => {
+                let section = Section { source, start: start + skip, length: take };
+                Ok(section.read(&app, &job).await?.boxed())
             }
-            Self::Framing { pieces, length, make } => {
-                let mut sums = Vec::with_capacity(pieces.len());
-                for piece in pieces.iter() {
-                    let name = &piece.file.name;
-                    let sum = app.store.result_crc32(&job, piece.snapshot, name).await;
-                    sums.push(sum.map_err(told)?);
+            Self::Framing { sources, length, make } => {
+                let mut sums = Vec::with_capacity(sources.len());
+                for source in sources.iter() {
+                    let name = &source.file.name;
+                    let sum = app.store.result_crc32(&job, source.snapshot, name).await;
+                    sums.push(sum.map_err(abort)?);
                 }
                 let bytes = Bytes::from(make(&sums));
                 debug_assert_eq!(bytes.len() as u64, length);
-                Ok(once(&bytes, skip, take))
+                Ok(slice_stream(&bytes, skip, take))
             }
-            Self::Lines { piece, shared: (shared, start, length), lines } => {
-                let shared = part(&app, &job, (&shared, start, length)).await?;
-                let shared: Vec<Bytes> = shared.try_collect().await?;
-                let file = open(&app, &job, &piece).await.map_err(told)?;
-                Ok(lines.read(file, shared.concat().into(), (skip, take)).await?.boxed())
+            Self::Lines { source, shared, lines } => {
+                let shared: Vec<Bytes> = shared.read(&app, &job).await?.try_collect().await?;
+                let file = open(&app, &job, &source).await.map_err(abort)?;
+                Ok(lines.read(file, shared.concat().into(), skip, take).await?.boxed())
             }
         }
     }
 }
 
-type Bytewise = BoxStream<'static, io::Result<Bytes>>;
+impl Section {
+    fn hash_inputs(&self, hasher: &mut sha2::Sha256) {
+        let Self { source, start, length } = self;
+        hasher.update(format!("{start} {length} {}\n", source.file.sha256));
+    }
 
+    async fn read(&self, app: &App, job: &Job) -> io::Result<ReaderStream<Take<File>>> {
+        let file = open(app, job, &self.source).await.map_err(abort)?;
+        let bytes = download::stream_range(file, self.start, self.length).await;
+        bytes.map_err(|_| io::Error::other("a stored file can't be read"))
+    }
+}
+
+type ByteStream = BoxStream<'static, io::Result<Bytes>>;
+
+/// Streams `take` bytes after the first `skip` bytes.
 #[allow(clippy::cast_possible_truncation)] // within the bytes
-fn once(bytes: &Bytes, skip: u64, take: u64) -> Bytewise {
+fn slice_stream(bytes: &Bytes, skip: u64, take: u64) -> ByteStream {
     let bytes = bytes.slice(skip as usize..(skip + take) as usize);
     stream::iter([Ok(bytes)]).boxed()
 }
 
-/// Opens a result file, unless it is another one by now.
-async fn open(app: &App, job: &Job, piece: &Piece) -> Result<std::fs::File, StoreError> {
-    let (file, _, opened) = app.store.open_result(job, piece.snapshot, &piece.file.name).await?;
-    if file.sha256 == piece.file.sha256 { Ok(opened) } else { Err(StoreError::Interrupted) }
+/// Opens a result file.
+///
+/// Errors: [`StoreError::Interrupted`] if a retried job has replaced the file since the request began.
+async fn open(app: &App, job: &Job, source: &Source) -> Result<std::fs::File, StoreError> {
+    let (file, _, opened) = app.store.open_result(job, source.snapshot, &source.file.name).await?;
+    if file.sha256 == source.file.sha256 { Ok(opened) } else { Err(StoreError::Interrupted) }
 }
 
-/// Bytes of a result file: where they begin, and how many.
-async fn part(
-    app: &App,
-    job: &Job,
-    (piece, start, length): (&Piece, u64, u64),
-) -> io::Result<ReaderStream<Take<File>>> {
-    let file = open(app, job, piece).await.map_err(told)?;
-    let bytes = download::part(file, start, length).await;
-    bytes.map_err(|_| io::Error::other("a stored file can't be read"))
-}
-
-/// An answer that has begun can only break off; why, the log says.
-fn told(error: StoreError) -> io::Error {
-    tracing::error!(%error, "a download breaks off");
+/// Logs an error that occurs after the status was sent. The answer can only be aborted then.
+fn abort(error: StoreError) -> io::Error {
+    tracing::error!(%error, "a download is aborted");
     io::Error::other(error)
 }
 
-/// A file of parts.
+/// A file composed of parts.
 #[derive(Debug)]
 pub(super) struct Composed {
     pub(super) parts: Vec<Part>,
@@ -168,8 +177,9 @@ pub(super) struct Composed {
 }
 
 impl Composed {
-    /// Answers with the file or the part of it that is asked for.
-    /// Errors: 500 if the first result files in it are damaged; where a later one is, the answer breaks off.
+    /// Answers with the file or the requested range.
+    ///
+    /// Errors: 500 if the first result file of the range is damaged. A damaged file further on aborts the answer.
     pub(super) async fn send(
         self,
         app: &App,
@@ -177,28 +187,28 @@ impl Composed {
         request: (&Method, &HeaderMap),
     ) -> Result<Response> {
         let mut hasher = sha2::Sha256::new();
-        self.parts.iter().for_each(|part| part.describe(&mut hasher));
+        self.parts.iter().for_each(|part| part.hash_inputs(&mut hasher));
         let download = Download {
             sha256: Sha256::new(hasher.finalize().into()),
             size: self.parts.iter().map(Part::length).sum(),
             kind: self.kind,
             disposition: self.disposition,
-            in_parts: true,
+            accepts_ranges: true,
         };
         let parts = self.parts;
         let read = async |start, length| {
-            let wanted = within(parts, start, length);
-            let first =
-                wanted.iter().map(|(part, ..)| part.pieces()).find(|found| !found.is_empty());
-            for piece in first.unwrap_or_default() {
-                open(app, &job, piece).await?;
+            let selection = select(parts, start, length);
+            let mut sources = selection.iter().map(|selected| selected.part.sources());
+            let first_sources = sources.find(|sources| !sources.is_empty());
+            for source in first_sources.unwrap_or_default() {
+                open(app, &job, source).await?;
             }
             let (app, job) = (app.clone(), Arc::new(job));
-            let streams = stream::iter(wanted).then(move |(part, skip, take)| {
+            let streams = stream::iter(selection).then(move |Selected { part, skip, take }| {
                 let (app, job) = (app.clone(), job.clone());
                 async move {
-                    // Runs as a separate task: nobody polls the body while the client is slow, and an unpolled
-                    // query keeps its connection.
+                    // The body is not polled while the client is slow, and an unpolled query keeps its connection
+                    // to the database. A separate task completes the query anyway.
                     let read = tokio::spawn(part.read(app, job, skip, take));
                     read.await.unwrap_or_else(|error| Err(io::Error::other(error)))
                 }
@@ -209,37 +219,47 @@ impl Composed {
     }
 }
 
-/// The parts that have bytes in a range, with what is left out of the first and what is taken of each.
-fn within(parts: Vec<Part>, start: u64, length: u64) -> Vec<(Part, u64, u64)> {
-    let (mut at, end) = (0, start + length);
-    let mut found = Vec::new();
+/// The bytes of a part that are in a range of the file.
+struct Selected {
+    part: Part,
+    /// Number of bytes before the range.
+    skip: u64,
+    /// Number of bytes in the range.
+    take: u64,
+}
+
+/// Selects the parts with bytes in a range of the file.
+fn select(parts: Vec<Part>, start: u64, length: u64) -> Vec<Selected> {
+    let end = start + length;
+    let mut part_end = 0;
+    let mut selection = Vec::new();
     for part in parts {
-        let (from, to) = (at, at + part.length());
-        at = to;
-        let (first, last) = (start.max(from), end.min(to));
-        if first < last {
-            found.push((part, first - from, last - first));
+        let part_start = part_end;
+        part_end += part.length();
+        let (from, to) = (start.max(part_start), end.min(part_end));
+        if from < to {
+            selection.push(Selected { part, skip: from - part_start, take: to - from });
         }
     }
-    found
+    selection
 }
 
 #[cfg(test)]
 mod tests {
     use axum::body::Bytes;
 
-    use super::{Part, within};
+    use super::{Part, select};
 
     #[test]
-    fn a_range_takes_what_it_needs_of_each_part() {
+    fn a_range_selects_bytes_of_each_part() {
         let parts = || ["abc", "", "defg"].map(|text| Part::Bytes(Bytes::from(text))).to_vec();
-        let taken = |start, length| {
-            let found = within(parts(), start, length);
-            found.iter().map(|(_, skip, take)| (*skip, *take)).collect::<Vec<_>>()
+        let ranges = |start, length| {
+            let selection = select(parts(), start, length);
+            selection.iter().map(|selected| (selected.skip, selected.take)).collect::<Vec<_>>()
         };
-        assert_eq!(taken(0, 7), [(0, 3), (0, 4)]);
-        assert_eq!(taken(2, 2), [(2, 1), (0, 1)]);
-        assert_eq!(taken(3, 1), [(0, 1)]);
-        assert_eq!(taken(7, 0), []);
+        assert_eq!(ranges(0, 7), [(0, 3), (0, 4)]);
+        assert_eq!(ranges(2, 2), [(2, 1), (0, 1)]);
+        assert_eq!(ranges(3, 1), [(0, 1)]);
+        assert_eq!(ranges(7, 0), []);
     }
 }

@@ -8,27 +8,27 @@ use engine::job::MovieFormat;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(in crate::http) enum Format {
-    /// All frames of a snapshot as one multi-part EXR.
+    /// All frames of a snapshot as a multi-part EXR.
     Exr,
     /// All frames as one array.
     Npy,
     /// A BigTIFF with a page per frame.
     Tiff,
-    /// A Zarr array, which is a tree of files.
+    /// A Zarr array, which is a directory of files.
     Zarr,
-    /// A movie.
+    /// A movie of all frames.
     Mp4,
-    /// A movie for presentations.
+    /// A movie of all frames for presentation programs.
     Gif,
-    /// Each frame of a snapshot as EXR and PNG, which is a tree of files.
+    /// A directory with an EXR and a PNG of each frame of a snapshot.
     Frames,
     /// Frames of a colour sensor before demosaicking.
     Mosaic,
-    /// The expected error of blocks of the frames.
+    /// The expected error of each block of each frame.
     Error,
-    /// Inputs, parameters and outcome.
+    /// A record of inputs, parameters and results.
     Manifest,
-    /// All files of a job.
+    /// An archive of all files of a job.
     Zip,
 }
 

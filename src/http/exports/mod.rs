@@ -1,5 +1,5 @@
-//! Frames in the formats of other programs, of a snapshot or of a whole job. Most exports are composed while they are
-//! read and take no space on the disk; movies are encoded by workers.
+//! Exports: the frames of a snapshot or of a whole job, in formats that other programs read. Most exports are composed
+//! while a client reads them, and take no disk space. Workers encode movies.
 
 mod archive;
 mod clip;
@@ -24,18 +24,18 @@ pub(super) use movie::create;
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ExportQuery {
-    /// Layers of an EXR beside its frames.
+    /// Additional layers of an EXR.
     layers: Option<Layer>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Layer {
-    /// The expected error.
+    /// The expected error of the pixels.
     Sigma,
 }
 
-/// An export that is one file.
+/// Sends an export that is a single file.
 pub(super) async fn file(
     clip: Clip,
     QueryOf(query): QueryOf<ExportQuery>,
@@ -44,7 +44,10 @@ pub(super) async fn file(
 ) -> Result<Response> {
     let request = (&method, &headers);
     if query.layers.is_some() && clip.format != Format::Exr {
-        return Err(ApiError::new(Code::InvalidQuery, "only exr has layers"));
+        return Err(ApiError::new(
+            Code::InvalidQuery,
+            "layers is only valid for exr: remove it, or ask for exr",
+        ));
     }
     match (clip.format, clip.snapshot) {
         (Format::Exr, Some(_)) => match query.layers {
@@ -57,32 +60,37 @@ pub(super) async fn file(
         (Format::Mp4, _) => movie::movie(clip, MovieFormat::Mp4, request).await,
         (Format::Gif, _) => movie::movie(clip, MovieFormat::Gif, request).await,
         (Format::Mosaic, Some(_)) if clip.job.spec.shape.mosaic.is_none() => {
-            let detail = "the sensor of this job is grey: npy has its frames";
+            let detail =
+                "the sensor of this job is grey and has no mosaic: the export npy has its frames";
             Err(ApiError::new(Code::NotFound, detail))
         }
         (Format::Mosaic, Some(_)) => stored(&clip, "mosaic.npy", request).await,
         (Format::Error, Some(_)) => stored(&clip, "error.npy", request).await,
         (Format::Manifest, _) => stored(&clip, "manifest.json", request).await,
         (Format::Zip, None) => archive::archive(clip, request).await,
-        (Format::Zip, Some(_)) => elsewhere("zip is an export of the whole job"),
-        (Format::Zarr, _) => elsewhere("zarr is a tree: it begins with zarr/zarr.json"),
-        (Format::Frames, Some(_)) => elsewhere("frames is a tree: it begins with frames/1.exr"),
-        (Format::Exr | Format::Frames | Format::Mosaic | Format::Error, None) => {
-            elsewhere("this format is an export of a snapshot: snapshots/N/exports/ has it")
+        (Format::Zip, Some(_)) => {
+            not_found("zip exports the whole job: ask for it at exports of the job")
         }
+        (Format::Zarr, _) => not_found("zarr is a directory: its metadata are at zarr/zarr.json"),
+        (Format::Frames, Some(_)) => {
+            not_found("frames is a directory: its first file is frames/1.exr")
+        }
+        (Format::Exr | Format::Frames | Format::Mosaic | Format::Error, None) => not_found(
+            "this format exports a single snapshot: ask for it at snapshots/N/exports/ of the job",
+        ),
     }
 }
 
-/// The rest of the path in a tree.
+/// The path of a file in an export that is a directory.
 #[derive(Deserialize)]
-pub(super) struct InTree {
+pub(super) struct FilePath {
     path: String,
 }
 
-/// A file of an export that is a tree.
+/// Sends a file of an export that is a directory.
 pub(super) async fn part(
     clip: Clip,
-    Params(InTree { path }): Params<InTree>,
+    Params(FilePath { path }): Params<FilePath>,
     method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
@@ -92,16 +100,18 @@ pub(super) async fn part(
         (Format::Frames, Some(_)) => {
             let frames = clip.job.spec.shape.frames;
             let name = frame_file(&path, frames).ok_or_else(|| {
-                let detail = format!("frames are 1.exr to {frames}.exr, and the same with .png");
+                let detail = format!("frames are 1.exr to {frames}.exr, and 1.png to {frames}.png");
                 ApiError::new(Code::NotFound, detail)
             })?;
             stored(&clip, &name, request).await
         }
-        _ => elsewhere("this format is no tree; zarr and the frames of a snapshot are"),
+        _ => not_found(
+            "this format is a single file; only zarr and the frames of a snapshot are directories",
+        ),
     }
 }
 
-fn elsewhere(detail: &str) -> Result<Response> {
+fn not_found(detail: &str) -> Result<Response> {
     Err(ApiError::new(Code::NotFound, detail))
 }
 

@@ -1,5 +1,5 @@
-//! The frames of a snapshot, or of all snapshots of a job in order, as a movie. Encoding takes long, so a worker does it
-//! when a request creates the movie.
+//! The frames of a snapshot, or of all snapshots of a job in order, as a movie. Encoding takes long, so a worker encodes
+//! the movie once a client has requested it with POST.
 
 use axum::Json;
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
@@ -17,8 +17,8 @@ use engine::job::{JobId, MIN_MOVIE_SIDE, MovieFormat};
 use engine::pipeline::movie::DisplayWindow;
 use store::{Movie, StoreError};
 
-/// Seconds after which to ask again.
-const AGAIN: HeaderValue = HeaderValue::from_static("1");
+/// Seconds between two requests of a client that waits for a movie.
+const RETRY_SECONDS: HeaderValue = HeaderValue::from_static("1");
 
 /// The body of `POST /v1/jobs/{job}/exports`.
 #[derive(Debug, Deserialize)]
@@ -65,10 +65,10 @@ pub(in crate::http) async fn create(
         return Err(ApiError::field("/snapshot", format!("the job has no snapshot {missing}")));
     }
     let base = snapshot.map_or(String::new(), |snapshot| format!("/snapshots/{snapshot}"));
-    let place = format!("/v1/jobs/{id}{base}/exports/{}", extension(format));
+    let address = format!("/v1/jobs/{id}{base}/exports/{}", extension(format));
     let clip = Clip { app, job, snapshot, format: format.into() };
     check(&clip, format).await?;
-    let window = display_window(&clip.app, id, (black, white)).await?;
+    let window = requested_window(&clip.app, id, black, white).await?;
     let (status, body) =
         match clip.app.store.create_movie(&clip.job, (snapshot, format), &window).await? {
             Movie::Ready { .. } => {
@@ -77,11 +77,11 @@ pub(in crate::http) async fn create(
             Movie::Asked(fraction) => (StatusCode::ACCEPTED, pending(fraction)),
             Movie::Failed(reason) => return Err(failed(&reason)),
         };
-    Ok((status, [(header::LOCATION, place)], [(header::RETRY_AFTER, AGAIN)], Json(body))
+    Ok((status, [(header::LOCATION, address)], [(header::RETRY_AFTER, RETRY_SECONDS)], Json(body))
         .into_response())
 }
 
-/// A movie, at ten frames per second.
+/// The movie in a format, at ten frames per second.
 pub(super) async fn movie(
     clip: Clip,
     format: MovieFormat,
@@ -98,12 +98,12 @@ pub(super) async fn movie(
             let kind = media_type(&name);
             let name = file_name(clip.job.id, clip.snapshot, &name);
             let disposition = format!("inline; {name}");
-            let download = Download { sha256, size, kind, disposition, in_parts: true };
+            let download = Download { sha256, size, kind, disposition, accepts_ranges: true };
             download.send(async { Ok(file) }, request).await
         }
         Some(Movie::Asked(fraction)) => {
             let fields = [
-                (header::RETRY_AFTER, AGAIN),
+                (header::RETRY_AFTER, RETRY_SECONDS),
                 (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
             ];
             Ok((StatusCode::ACCEPTED, fields, Json(pending(fraction))).into_response())
@@ -113,7 +113,9 @@ pub(super) async fn movie(
     }
 }
 
-/// Refuses frames that have no movie, or that are not there.
+/// Checks that the frames exist and that a movie can show them.
+///
+/// Errors: 404 if a side of the movie would be too short, or if the frames do not exist yet.
 async fn check(clip: &Clip, format: MovieFormat) -> Result<()> {
     if !clip.job.spec.has_movie(format) {
         let detail = format!(
@@ -122,15 +124,16 @@ async fn check(clip: &Clip, format: MovieFormat) -> Result<()> {
         );
         return Err(ApiError::new(Code::NotFound, detail));
     }
-    clip.pieces().await?;
+    clip.sources().await?;
     Ok(())
 }
 
-/// The requested values of black and white as the store keeps them; null for the job's white level.
-async fn display_window(
+/// The requested display window in the form that the store keeps. Null stands for 0 to the job's white level.
+async fn requested_window(
     app: &App,
     job: JobId,
-    (black, white): (Option<f32>, Option<f32>),
+    black: Option<f32>,
+    white: Option<f32>,
 ) -> Result<Value> {
     if black.is_none() && white.is_none() {
         return Ok(Value::Null);
@@ -139,12 +142,9 @@ async fn display_window(
         None => white_level(app, job).await?,
         white => white,
     };
-    let (black, white) = (black.unwrap_or(0.0), white.unwrap_or(1.0));
-    if !(black.is_finite() && white.is_finite() && black < white && (white - black).is_finite()) {
-        let detail = format!("black is {black} and white is {white}; black must be below white");
-        return Err(ApiError::field("/black", detail));
-    }
-    serde_json::to_value(DisplayWindow { black, white }).map_err(|error| ApiError::internal(&error))
+    let window = DisplayWindow::new(black.unwrap_or(0.0), white.unwrap_or(1.0))
+        .map_err(|error| ApiError::field("/black", error.to_string()))?;
+    serde_json::to_value(window).map_err(|error| ApiError::internal(&error))
 }
 
 fn pending(fraction: Option<f64>) -> ExportBody {
@@ -154,7 +154,8 @@ fn pending(fraction: Option<f64>) -> ExportBody {
 
 fn missing(format: MovieFormat) -> ApiError {
     let detail = format!(
-        "there is no movie yet: POST {{\"format\": \"{}\"}} to exports of the job, with the snapshot, creates it",
+        "there is no movie yet: to create it, POST {{\"format\": \"{}\"}} to exports of the job, with the snapshot \
+         if the movie is of one",
         extension(format)
     );
     ApiError::new(Code::NotFound, detail)
@@ -169,6 +170,6 @@ fn extension(format: MovieFormat) -> &'static str {
 }
 
 fn failed(reason: &str) -> ApiError {
-    let detail = format!("{reason}. POST to exports of the job tries again");
+    let detail = format!("{reason}. To try again, POST to exports of the job");
     ApiError::new(Code::MovieFailed, detail)
 }

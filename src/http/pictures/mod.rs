@@ -1,5 +1,5 @@
-//! Pictures for looking at: frames, measurements and masks as 8-bit PNG, whole and reduced, or in
-//! tiles at any zoom, with a window of contrast. The numbers themselves are in the results.
+//! Pictures of frames, measurements and masks for viewers: 8-bit PNG of a display window, either reduced to a preview or
+//! in tiles at several zoom levels. The results have the exact values.
 
 mod names;
 mod source;
@@ -17,13 +17,15 @@ use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf};
-use super::rendering::{self, Picture, Region, TILE};
+use super::rendering::{self, Picture, Region, Spread, TILE};
 use engine::job::Sha256;
+use engine::pipeline::movie::DisplayWindow;
 use formats::png;
 
-/// Pixels of a preview's longer side: default, and the range.
-const PREVIEW: usize = 512;
-const PREVIEWS: std::ops::RangeInclusive<usize> = 16..=1024;
+/// Default length of the longer side of a preview, in pixels.
+const PREVIEW_SIDE: usize = 512;
+/// Lengths of the longer side of a preview that a request may ask for, in pixels.
+const PREVIEW_SIDES: std::ops::RangeInclusive<usize> = 16..=1024;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -72,17 +74,18 @@ pub(super) async fn preview<N: Named>(
     headers: HeaderMap,
 ) -> Result<Response> {
     let picture = name.find(&app, &access.lab).await?;
-    let size = query.size.unwrap_or(PREVIEW);
-    if !PREVIEWS.contains(&size) {
-        let (least, most) = (PREVIEWS.start(), PREVIEWS.end());
+    let size = query.size.unwrap_or(PREVIEW_SIDE);
+    if !PREVIEW_SIDES.contains(&size) {
+        let (least, most) = (PREVIEW_SIDES.start(), PREVIEW_SIDES.end());
         let detail = format!("size is {size}; it must be from {least} to {most}");
         return Err(ApiError::new(Code::InvalidQuery, detail));
     }
     let window = match (query.black, query.white.or(picture.white)) {
         (None, None) => None,
-        (black, Some(white)) => Some(window(black.unwrap_or(0.0), white)?),
+        (black, Some(white)) => Some(display_window(black.unwrap_or(0.0), white)?),
         (Some(_), None) => {
-            let detail = "black needs white here: this picture has no white level";
+            let detail =
+                "black without white: this picture has no white level, so state white, too";
             return Err(ApiError::new(Code::InvalidQuery, detail));
         }
     };
@@ -98,7 +101,7 @@ pub(super) async fn tile<N: Named>(
     headers: HeaderMap,
 ) -> Result<Response> {
     let picture = name.find(&app, &access.lab).await?;
-    let window = window(query.black, query.white)?;
+    let window = display_window(query.black, query.white)?;
     let region = picture.tile(level, row, column).ok_or_else(|| {
         let detail = format!(
             "there is no tile {level}/{row}/{column} of {}x{} pixels (rows x columns); tiles have \
@@ -120,30 +123,27 @@ pub(super) async fn spread<N: Named>(
     let picture = name.find(&app, &access.lab).await?;
     let (height, width) = (picture.height, picture.width);
     let levels = picture.level_within(TILE);
-    let region = picture.whole(picture.level_within(PREVIEW));
+    let region = picture.whole(picture.level_within(PREVIEW_SIDE));
     let white = picture.white;
-    let found = rendering::spread(&*app.pictures.reduced(Arc::new(picture), region).await?);
-    let (minimum, maximum, low, high) = (found.minimum, found.maximum, found.low, found.high);
+    let values = app.pictures.reduced(Arc::new(picture), region).await?;
+    let Spread { minimum, maximum, low, high } = rendering::spread(&values);
     let (low, high) = white.map_or((low, high), |white| (0.0, white));
     let body = SpreadBody { height, width, tile: TILE, levels, minimum, maximum, low, high };
     conditional::json(&body, &headers)
 }
 
-/// The values that become black and white.
-pub(super) fn window(black: f32, white: f32) -> Result<(f32, f32)> {
-    if black.is_finite() && white.is_finite() && black < white && (white - black).is_finite() {
-        return Ok((black, white));
-    }
-    let detail = format!("black is {black} and white is {white}; black must be below white");
-    Err(ApiError::new(Code::InvalidQuery, detail))
+fn display_window(black: f32, white: f32) -> Result<DisplayWindow> {
+    DisplayWindow::new(black, white)
+        .map_err(|error| ApiError::new(Code::InvalidQuery, error.to_string()))
 }
 
-/// Answers with a region as PNG, or with word that the client has it, which reads nothing.
+/// Answers with a region of a picture as PNG. If the client has it, the answer is 304 and no values are read. Without a
+/// window, black and white are set so that half a percent of the pixels is below and above.
 async fn draw(
     app: &App,
     picture: Picture,
     region: Region,
-    window: Option<(f32, f32)>,
+    window: Option<DisplayWindow>,
     headers: &HeaderMap,
 ) -> Result<Response> {
     let content = format!("picture/1 {} {region:?} {window:?}", picture.identity);
@@ -158,9 +158,9 @@ async fn draw(
     let channels = picture.channels;
     let values = app.pictures.reduced(Arc::new(picture), region).await?;
     let encode = tokio::task::spawn_blocking(move || {
-        let (black, white) = window.unwrap_or_else(|| {
-            let found = rendering::spread(&values);
-            (found.low, if found.high > found.low { found.high } else { found.low + 1.0 })
+        let DisplayWindow { black, white } = window.unwrap_or_else(|| {
+            let Spread { low, high, .. } = rendering::spread(&values);
+            DisplayWindow { black: low, white: if high > low { high } else { low + 1.0 } }
         });
         png::encode_u8(values.view(), channels, black, white)
     });

@@ -1,13 +1,14 @@
-//! What pictures are called, and which values that means.
+//! Names of pictures in addresses, and the values that each name stands for.
 
 use std::sync::Arc;
 
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
-use super::source::{DoneTile, Files, Stack, Unfinished, errors, sent};
+use super::source::{Files, FinishedTile, Stack, Unfinished, expected_error, uploaded_frame};
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
+use crate::http::extract::canonical_number;
 use crate::http::intake;
 use crate::http::jobs::with_snapshot;
 use crate::http::rendering::Picture;
@@ -17,48 +18,49 @@ use engine::pipeline::records::TileTaskRecord;
 use formats;
 use store::{Calibration, Job, Measurement, StoreError, TileResult};
 
-/// What can be seen of a job's snapshot.
+/// The name of a picture of a job's snapshot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 enum JobPicture {
-    /// `frame-1` and so on.
+    /// `frame-N`, from 1.
     Frame(usize),
-    /// `difference-2`: frame 2 without frame 1.
+    /// `difference-N`: frame N minus frame N-1, from 2.
     Difference(usize),
+    /// `residual`: the difference between the measurement and the masked sum of the frames.
     Residual,
-    /// `error-1`: the expected error of frame 1.
+    /// `error-N`: the expected error of frame N, from 1.
     Error(usize),
-    /// `slice-0`: all frames at row 0.
+    /// `slice-N`: row N of all frames, from 0.
     Slice(usize),
 }
 
-/// A picture of a file that was sent: `frame-1` and so on.
+/// The name of a picture of an uploaded file: `frame-N`, from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 struct BlobPicture(usize);
 
-/// A picture of a measurement: `snapshot-0` and so on.
+/// The name of a picture of a measurement: `snapshot-N`, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 struct MeasurementPicture(usize);
 
+/// The name of a picture of a calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 enum CalibrationPicture {
-    /// `mask-1` and so on.
+    /// `mask-N`, from 1.
     Mask(usize),
-    /// `mean` of the masks.
+    /// `mean`: the mean of all masks.
     Mean,
-    /// `gram`: sum of their squares.
+    /// `gram`: the sum of the squares of all masks.
     Gram,
-    /// `dead`: 1 where all are dark.
+    /// `dead`: 1 at pixels that are dark in all masks, otherwise 0.
     Dead,
 }
 
-/// The number after a name, in the one form that it is written in.
+/// The number in a text of the form NAME-NUMBER.
 fn numbered(text: &str, name: &str) -> Option<usize> {
-    let digits = text.strip_prefix(name)?.strip_prefix('-')?;
-    digits.parse().ok().filter(|number: &usize| number.to_string() == digits)
+    canonical_number(text.strip_prefix(name)?.strip_prefix('-')?)
 }
 
 impl TryFrom<String> for JobPicture {
@@ -66,7 +68,7 @@ impl TryFrom<String> for JobPicture {
 
     fn try_from(text: String) -> Result<Self, String> {
         let number = |name| numbered(&text, name);
-        let found = match text.as_str() {
+        let picture = match text.as_str() {
             "residual" => Some(Self::Residual),
             _ => (number("frame").map(Self::Frame))
                 .or_else(|| number("difference").map(Self::Difference))
@@ -74,7 +76,7 @@ impl TryFrom<String> for JobPicture {
                 .or_else(|| number("slice").map(Self::Slice)),
         };
         let names = "pictures are frame-N, difference-N, error-N, slice-ROW and residual";
-        found.ok_or_else(|| names.into())
+        picture.ok_or_else(|| names.into())
     }
 }
 
@@ -109,12 +111,12 @@ impl TryFrom<String> for CalibrationPicture {
     }
 }
 
-/// The parameters of a path that name a picture.
+/// Parameters of a path that name a picture.
 pub(in crate::http) trait Named: DeserializeOwned + Send {
+    /// Errors: 404 if the lab has no such picture, or not yet.
     fn find(self, app: &App, lab: &Lab) -> impl Future<Output = Result<Picture>> + Send;
 }
 
-/// A picture of a job's snapshot.
 #[derive(Debug, Deserialize)]
 pub(in crate::http) struct OfJob {
     job: JobId,
@@ -148,21 +150,21 @@ impl Named for OfJob {
         if let JobPicture::Error(k) = picture
             && (1..=frames).contains(&k)
         {
-            return errors_of(app, &job, snapshot, k - 1).await;
+            return error_picture(app, &job, snapshot, k - 1).await;
         }
-        let stack = frames_of(app, &job, snapshot).await?;
+        let stack = frames_stack(app, &job, snapshot).await?;
         match picture {
             JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
             JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
             JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
             JobPicture::Residual => {
                 let masks = app.store.calibration(lab, job.spec.calibration).await?;
-                let masks = masks_of(app, &masks).await?;
+                let masks = masks_stack(app, &masks).await?;
                 let measurement = app.store.measurement(lab, job.spec.measurement).await?;
-                let measurement = snapshots_of(app, &measurement).await?;
+                let measurement = snapshots_stack(app, &measurement).await?;
                 Ok(stack.residual(&masks, &measurement, snapshot as usize))
             }
-            _ => Err(outside(format!(
+            _ => Err(not_found(format!(
                 "frames are counted from 1 to {frames}, differences from 2, rows from 0 to {}",
                 height.saturating_sub(1)
             ))),
@@ -175,38 +177,38 @@ impl Named for OfBlob {
         let Self { sha256, picture: BlobPicture(frame) } = self;
         app.store.upload(lab, sha256).await?;
         let path = intake::upload(app, sha256).await?;
-        let (limits, opened) = (app.limits, path.clone());
-        let opening = move || formats::open_stack(&opened, &limits).map(|reader| *reader.info());
-        let info = tokio::task::spawn_blocking(opening).await;
+        let (limits, file) = (app.limits, path.clone());
+        let read_info = move || formats::open_stack(&file, &limits).map(|reader| *reader.info());
+        let info = tokio::task::spawn_blocking(read_info).await;
         let info = info.map_err(|error| ApiError::internal(&error))??;
         if !(1..=info.frames).contains(&frame) {
-            return Err(outside(format!("frames are counted from 1 to {}", info.frames)));
+            return Err(not_found(format!("frames are counted from 1 to {}", info.frames)));
         }
-        Ok(sent(path, limits, &info, (sha256, frame)))
+        Ok(uploaded_frame(path, limits, &info, sha256, frame))
     }
 }
 
 impl Named for OfMeasurement {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let measurement = app.store.measurement(lab, self.measurement).await?;
-        let stack = snapshots_of(app, &measurement).await?;
+        let stack = snapshots_stack(app, &measurement).await?;
         let (MeasurementPicture(snapshot), count) = (self.picture, stack.shape.0);
         if snapshot < count {
             return Ok(stack.frame(snapshot));
         }
-        Err(outside(format!("snapshots are counted from 0 to {}", count.saturating_sub(1))))
+        Err(not_found(format!("snapshots are counted from 0 to {}", count.saturating_sub(1))))
     }
 }
 
 impl Named for OfCalibration {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let calibration = app.store.calibration(lab, self.calibration).await?;
-        let stack = masks_of(app, &calibration).await?;
+        let stack = masks_stack(app, &calibration).await?;
         let count = stack.shape.0;
         match self.picture {
             CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
             CalibrationPicture::Mask(_) => {
-                Err(outside(format!("masks are counted from 1 to {count}")))
+                Err(not_found(format!("masks are counted from 1 to {count}")))
             }
             CalibrationPicture::Mean => Ok(stack.mean()),
             CalibrationPicture::Gram => Ok(stack.gram()),
@@ -215,29 +217,29 @@ impl Named for OfCalibration {
     }
 }
 
-fn outside(detail: String) -> ApiError {
+fn not_found(detail: String) -> ApiError {
     ApiError::new(Code::NotFound, detail)
 }
 
-async fn masks_of(app: &App, calibration: &Calibration) -> Result<Stack> {
+async fn masks_stack(app: &App, calibration: &Calibration) -> Result<Stack> {
     let facts = &calibration.facts;
-    prepared(app, calibration.prepared, (facts.frames, facts.height, facts.width)).await
+    prepared_stack(app, calibration.prepared, (facts.frames, facts.height, facts.width)).await
 }
 
-async fn snapshots_of(app: &App, measurement: &Measurement) -> Result<Stack> {
+async fn snapshots_stack(app: &App, measurement: &Measurement) -> Result<Stack> {
     let facts = &measurement.facts;
     let shape = (facts.snapshots as usize, facts.height, facts.width);
-    prepared(app, measurement.prepared, shape).await
+    prepared_stack(app, measurement.prepared, shape).await
 }
 
-async fn prepared(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Result<Stack> {
+async fn prepared_stack(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Result<Stack> {
     let files = Files::Prepared(app.store.intact_blob(sha256).await?);
     Ok(Stack { shape, identity: sha256.to_string(), files, mosaic: None, white: None })
 }
 
-/// The frames of a snapshot: those of the result, or the tiles that are done, on the preview. The bytes of
-/// these are compared with the record when they are assembled.
-async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
+/// The frames of a snapshot. Before they are assembled, the finished tiles are shown on top of the preview. The hashes of
+/// these files are not checked here, but when the frames are assembled.
+async fn frames_stack(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let spec = &job.spec;
     let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
     match app.store.open_result(job, Some(snapshot), "frames.npy").await {
@@ -253,42 +255,45 @@ async fn frames_of(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
         Err(StoreError::NotFound { .. }) => {}
         Err(error) => return Err(error.into()),
     }
-    let done = app.store.tile_results(job.id, snapshot).await?;
+    let results = app.store.tile_results(job.id, snapshot).await?;
     let preview = app.store.preview(job.id, snapshot).await?;
-    if done.is_empty() && preview.is_none() {
-        let detail = "neither the preview nor a tile of this snapshot is done yet; the job's state \
-                      says how far it is";
+    if results.is_empty() && preview.is_none() {
+        let detail = "neither the preview nor a tile of this snapshot is finished yet; try again later, or \
+                      look at the state of the job";
         return Err(ApiError::new(Code::NotReady, detail));
     }
-    let parts = preview.iter().map(|(sha256, _)| sha256).chain(done.iter().map(|t| &t.sha256));
-    let hashes: String = parts.map(ToString::to_string).collect();
+    let files = preview.iter().map(|(sha256, _)| sha256);
+    let files = files.chain(results.iter().map(|result| &result.sha256));
+    let hashes: String = files.map(ToString::to_string).collect();
     let plan = spec.tile_plan().map_err(|error| ApiError::internal(&error))?;
-    let place = |done: TileResult| {
-        let tile = plan.tile(done.tile as usize)?;
-        let place = (snapshot - done.run) as usize;
-        // What the pilot has left to another run is not here.
-        let record: TileTaskRecord = serde_json::from_value(done.record).ok()?;
-        if !record.solved.contains(&place) {
+    let finished_tile = |result: TileResult| {
+        let tile = plan.tile(result.tile as usize)?;
+        let index_in_run = (snapshot - result.run) as usize;
+        // The pilot may have assigned this snapshot to another run. Then this result lacks it.
+        let record: TileTaskRecord = serde_json::from_value(result.record).ok()?;
+        if !record.solved.contains(&index_in_run) {
             return None;
         }
         let window = tile.window();
         let (rows, columns, step) = (window.rows, window.columns, window.step);
-        let first = place * spec.shape.frames;
-        Some(DoneTile { rows, columns, step, first, path: app.store.dir().blob(&done.sha256) })
+        let first_frame = index_in_run * spec.shape.frames;
+        let path = app.store.dir().blob(&result.sha256);
+        Some(FinishedTile { rows, columns, step, first_frame, path })
     };
-    let tiles = done.into_iter().filter_map(place).collect();
+    let tiles = results.into_iter().filter_map(finished_tile).collect();
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };
     let identity = Sha256::of(hashes.as_bytes()).to_string();
     let files = Files::Tiles(Arc::new(unfinished));
     Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic, white: None })
 }
 
-/// The expected error of frame `k`, from 0.
-async fn errors_of(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<Picture> {
+/// A picture of the expected error of frame `k`, from 0.
+async fn error_picture(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<Picture> {
     let SceneShape { height, width, .. } = job.spec.shape;
+    // Reports the reason if the file does not exist.
     result_file(app, job, Some(snapshot), "error.npy").await?;
     let (file, path, _) = app.store.open_result(job, Some(snapshot), "error.npy").await?;
-    Ok(errors(path, (height, width), (file.sha256, k)))
+    Ok(expected_error(path, height, width, file.sha256, k))
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! Where pictures come from: prepared arrays, result files, and tiles that are done while others
-//! are not.
+//! Sources of pictures: prepared arrays, result files, uploads, and the finished tiles of a snapshot that is still being
+//! reconstructed.
 
 use std::io::ErrorKind;
 use std::ops::Range;
@@ -13,49 +13,54 @@ use engine::job::{MARGIN, Mosaic, Sha256};
 use engine::pipeline::assessment::BLOCK;
 use formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
 
-/// A stack of f32 \[frames, rows, columns\] of which windows are read.
+/// A stack of f32 \[frames, rows, columns\] that is read in windows.
 #[derive(Debug, Clone)]
 pub(super) struct Stack {
     pub(super) shape: (usize, usize, usize),
+    /// Identifies the values, as in [`Picture::identity`].
     pub(super) identity: String,
     pub(super) files: Files,
-    /// Of frames that a colour sensor saw: result files have their colours, tiles have not.
+    /// The mosaic of a colour sensor, for frames. Result files are demosaicked; tiles and previews are not.
     pub(super) mosaic: Option<Mosaic>,
-    /// The white level of the job's frames; `None` before it is known, and for other stacks.
+    /// The white level of a job's frames; `None` before it is known, and for other stacks.
     pub(super) white: Option<f32>,
 }
 
 #[derive(Debug, Clone)]
 pub(super) enum Files {
+    /// A prepared array of an upload.
     Prepared(PathBuf),
+    /// The result file `frames.npy`.
     Frames(PathBuf),
-    /// Tiles of an unfinished result, on the preview; NaN where there is neither.
+    /// Finished tiles on top of the preview. Pixels without either are NaN.
     Tiles(Arc<Unfinished>),
 }
 
-/// What there is of a snapshot before it is assembled.
+/// Files of a snapshot that is not assembled yet.
 #[derive(Debug)]
 pub(super) struct Unfinished {
-    /// A prepared array of coarse frames.
+    /// A prepared array of frames at low resolution.
     pub(super) preview: Option<PathBuf>,
-    pub(super) tiles: Vec<DoneTile>,
+    pub(super) tiles: Vec<FinishedTile>,
 }
 
-/// A tile that is done, as a prepared array, the window that it covers, of which it has every `step`th pixel, and
-/// which of its frames is the snapshot's first.
+/// A finished tile of a run of snapshots, as a prepared array.
 #[derive(Debug)]
-pub(super) struct DoneTile {
+pub(super) struct FinishedTile {
+    /// Rows and columns of the frames that the tile covers.
     pub(super) rows: Range<usize>,
     pub(super) columns: Range<usize>,
+    /// The tile has every `step`th row and column: 2 for a sub-image of a mosaic, otherwise 1.
     pub(super) step: usize,
-    pub(super) first: usize,
+    /// Index of the snapshot's first frame in the array.
+    pub(super) first_frame: usize,
     pub(super) path: PathBuf,
 }
 
 type Window = Result<Array3<f32>, FormatError>;
 
 impl Stack {
-    /// What is shown: \[frames, rows, columns\], of colours \[frames, rows, 3 columns\].
+    /// The frames for display: \[frames, rows, columns\], or \[frames, rows, 3 columns\] for colours.
     fn window(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
         match (self.mosaic, &self.files) {
             (None, _) => self.stored(frames, rows, columns),
@@ -63,43 +68,46 @@ impl Stack {
                 self.stored(frames, rows, 3 * columns.start..3 * columns.end)
             }
             (Some(mosaic), _) => {
-                // The colours of a pixel follow from those around it.
-                let wider = |range: &Range<usize>, end: usize| {
+                // Demosaicking needs the pixels around the window, too.
+                let widened = |range: &Range<usize>, end: usize| {
                     range.start.saturating_sub(MARGIN)..(range.end + MARGIN).min(end)
                 };
-                let (down, across) = (wider(&rows, self.shape.1), wider(&columns, self.shape.2));
-                let first = (down.start, across.start);
-                let (top, left) = (rows.start - down.start, 3 * (columns.start - across.start));
-                let inside = s![top..top + rows.len(), left..left + 3 * columns.len()];
-                let seen = self.stored(frames, down, across)?;
-                let mut shown = Array3::zeros((seen.dim().0, rows.len(), 3 * columns.len()));
-                for (seen, mut shown) in seen.outer_iter().zip(shown.outer_iter_mut()) {
-                    shown.assign(&mosaic.demosaick(seen, first).slice(inside));
+                let (_, height, width) = self.shape;
+                let (down, across) = (widened(&rows, height), widened(&columns, width));
+                let first_pixel = (down.start, across.start);
+                let top = rows.start - down.start;
+                let first_sample = 3 * (columns.start - across.start);
+                let inside =
+                    s![top..top + rows.len(), first_sample..first_sample + 3 * columns.len()];
+                let raw = self.stored(frames, down, across)?;
+                let mut colours = Array3::zeros((raw.dim().0, rows.len(), 3 * columns.len()));
+                for (raw, mut colours) in raw.outer_iter().zip(colours.outer_iter_mut()) {
+                    colours.assign(&mosaic.demosaick(raw, first_pixel).slice(inside));
                 }
-                Ok(shown)
+                Ok(colours)
             }
         }
     }
 
-    /// The frames as the sensor sees them: \[frames, rows, columns\].
-    fn seen(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
+    /// The frames as the sensor records them, one colour for each pixel: \[frames, rows, columns\].
+    fn raw(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
         let (Some(mosaic), Files::Frames(_)) = (self.mosaic, &self.files) else {
             return self.stored(frames, rows, columns);
         };
-        let first = (rows.start, columns.start);
+        let first_pixel = (rows.start, columns.start);
         let colours = self.window(frames, rows.clone(), columns.clone())?;
-        let mut seen = Array3::zeros((colours.dim().0, rows.len(), columns.len()));
-        for (colours, mut seen) in colours.outer_iter().zip(seen.outer_iter_mut()) {
-            seen.assign(&mosaic.sample(colours, first));
+        let mut raw = Array3::zeros((colours.dim().0, rows.len(), columns.len()));
+        for (colours, mut raw) in colours.outer_iter().zip(raw.outer_iter_mut()) {
+            raw.assign(&mosaic.sample(colours, first_pixel));
         }
-        Ok(seen)
+        Ok(raw)
     }
 
     fn channels(&self) -> Channels {
         if self.mosaic.is_some() { Channels::Rgb } else { Channels::Grey }
     }
 
-    /// What the files have.
+    /// The values in the files.
     fn stored(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
         let limits = Limits::default();
         match &self.files {
@@ -110,12 +118,12 @@ impl Stack {
                 npy::open_windows(path, &limits)?.read_window(frames, rows, columns)
             }
             Files::Tiles(unfinished) => {
-                let mut whole = match &unfinished.preview {
-                    Some(path) => enlarged(path, self, frames.clone(), &rows, &columns)?,
+                let mut window = match &unfinished.preview {
+                    Some(path) => enlarge_preview(path, self, frames.clone(), &rows, &columns)?,
                     None => Array3::from_elem((frames.len(), rows.len(), columns.len()), f32::NAN),
                 };
-                lay(&unfinished.tiles, frames, rows, columns, &mut whole)?;
-                Ok(whole)
+                overlay_tiles(&unfinished.tiles, frames, rows, columns, &mut window)?;
+                Ok(window)
             }
         }
     }
@@ -124,6 +132,7 @@ impl Stack {
         !matches!(self.files, Files::Tiles(_))
     }
 
+    /// A picture of values that `read` computes from `depth` frames.
     fn picture<F>(&self, name: &str, depth: usize, read: F) -> Picture
     where
         F: Fn(&Self, Range<usize>, Range<usize>) -> Result<Array2<f32>, FormatError>
@@ -145,14 +154,15 @@ impl Stack {
         }
     }
 
+    /// Frame `k`, from 0.
     pub(super) fn frame(&self, k: usize) -> Picture {
         let picture = self.picture(&format!("frame {k}"), 1, move |stack, rows, columns| {
-            Ok(first(stack.window(k..k + 1, rows, columns)?))
+            Ok(first_frame(stack.window(k..k + 1, rows, columns)?))
         });
         Picture { white: self.white, ..picture }
     }
 
-    /// Frame `k` without the one before it.
+    /// Frame `k` minus the previous frame; `k` is at least 1.
     pub(super) fn difference(&self, k: usize) -> Picture {
         self.picture(&format!("difference {k}"), 2, move |stack, rows, columns| {
             let pair = stack.window(k - 1..k + 1, rows, columns)?;
@@ -160,7 +170,7 @@ impl Stack {
         })
     }
 
-    /// All frames at one row: \[frames, columns\].
+    /// One row of all frames: \[frames, columns\].
     pub(super) fn slice(&self, row: usize) -> Picture {
         let frames = self.shape.0;
         let picture = self.picture(&format!("slice {row}"), 1, move |stack, rows, columns| {
@@ -169,6 +179,7 @@ impl Stack {
         Picture { height: frames, white: self.white, ..picture }
     }
 
+    /// The mean of all frames.
     pub(super) fn mean(&self) -> Picture {
         let frames = self.shape.0;
         self.picture("mean", frames, move |stack, rows, columns| {
@@ -177,7 +188,7 @@ impl Stack {
         })
     }
 
-    /// The sum of the squares of all frames: of masks, the gram diagonal.
+    /// The sum of the squares of all frames. For masks, this is the diagonal of the Gram matrix `H Hᵀ`.
     pub(super) fn gram(&self) -> Picture {
         let frames = self.shape.0;
         self.picture("gram", frames, move |stack, rows, columns| {
@@ -186,7 +197,7 @@ impl Stack {
         })
     }
 
-    /// 1 where all frames are 0, else 0.
+    /// 1 at pixels where all frames are 0, otherwise 0.
     pub(super) fn dead(&self) -> Picture {
         let frames = self.shape.0;
         self.picture("dead", frames, move |stack, rows, columns| {
@@ -195,35 +206,36 @@ impl Stack {
         })
     }
 
-    /// `|y - Hx|` of these frames `x`, with the masks of `H` and frame `snapshot` of `y`.
+    /// The residual `|y - H x|`: `x` are these frames, `H` has the masks, and `y` is a snapshot of the measurement.
     pub(super) fn residual(&self, masks: &Self, measurement: &Self, snapshot: usize) -> Picture {
         let frames = self.shape.0;
         let name = format!("{} {} {snapshot} residual", masks.identity, measurement.identity);
         let (masks, measurement) = (masks.clone(), measurement.clone());
         let picture = self.picture(&name, 2 * frames, move |stack, rows, columns| {
             let y = measurement.window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
-            let mut rest = first(y);
+            let mut residual = first_frame(y);
             let masks = masks.window(0..frames, rows.clone(), columns.clone())?;
-            let x = stack.seen(0..frames, rows, columns)?;
+            let x = stack.raw(0..frames, rows, columns)?;
             for (mask, frame) in masks.outer_iter().zip(x.outer_iter()) {
-                ndarray::azip!((rest in &mut rest, &c in &mask, &x in &frame) *rest -= c * x);
+                ndarray::azip!((r in &mut residual, &c in &mask, &x in &frame) *r -= c * x);
             }
-            rest.mapv_inplace(f32::abs);
-            Ok(rest)
+            residual.mapv_inplace(f32::abs);
+            Ok(residual)
         });
         Picture { channels: Channels::Grey, ..picture }
     }
 }
 
-/// A frame, counted from 1, of a file as it was sent. Such files are read from their beginning, so the frame is read
-/// once and kept as long as the picture.
-pub(super) fn sent(
+/// A frame of an uploaded file, counted from 1. Most formats can only be read from the beginning, so the frame is read once
+/// and cached in the picture.
+pub(super) fn uploaded_frame(
     path: PathBuf,
     limits: Limits,
     info: &StackInfo,
-    (sha256, frame): (Sha256, usize),
+    sha256: Sha256,
+    frame: usize,
 ) -> Picture {
-    let kept: Mutex<Option<Array2<f32>>> = Mutex::default();
+    let cache: Mutex<Option<Array2<f32>>> = Mutex::default();
     Picture {
         height: info.height,
         width: info.width,
@@ -233,21 +245,23 @@ pub(super) fn sent(
         depth: 1,
         white: None,
         read: Box::new(move |rows, columns| {
-            let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
-            let whole = match &mut *kept {
-                Some(whole) => whole,
-                none => none.insert(nth_frame(&path, &limits, frame)?),
+            let mut cached = cache.lock().unwrap_or_else(PoisonError::into_inner);
+            let values = match &mut *cached {
+                Some(values) => values,
+                empty => empty.insert(nth_frame(&path, &limits, frame)?),
             };
-            Ok(whole.slice(s![rows, columns]).to_owned())
+            Ok(values.slice(s![rows, columns]).to_owned())
         }),
     }
 }
 
-/// The expected error of frame `k`, from 0, of a picture of this size: each pixel has that of its block.
-pub(super) fn errors(
+/// The expected error of frame `k`, from 0. The file has one value for each block of pixels.
+pub(super) fn expected_error(
     path: PathBuf,
-    (height, width): (usize, usize),
-    (sha256, k): (Sha256, usize),
+    height: usize,
+    width: usize,
+    sha256: Sha256,
+    k: usize,
 ) -> Picture {
     Picture {
         height,
@@ -258,10 +272,10 @@ pub(super) fn errors(
         depth: 1,
         white: None,
         read: Box::new(move |rows, columns| {
-            let of_blocks = |range: &Range<usize>| range.start / BLOCK..range.end.div_ceil(BLOCK);
-            let (down, across) = (of_blocks(&rows), of_blocks(&columns));
+            let to_blocks = |range: &Range<usize>| range.start / BLOCK..range.end.div_ceil(BLOCK);
+            let (down, across) = (to_blocks(&rows), to_blocks(&columns));
             let stored = npy::open_windows(&path, &Limits::default())?;
-            let blocks = first(stored.read_window(k..k + 1, down.clone(), across.clone())?);
+            let blocks = first_frame(stored.read_window(k..k + 1, down.clone(), across.clone())?);
             Ok(Array2::from_shape_fn((rows.len(), columns.len()), |(i, j)| {
                 blocks[[
                     (rows.start + i) / BLOCK - down.start,
@@ -274,21 +288,20 @@ pub(super) fn errors(
 
 fn nth_frame(path: &Path, limits: &Limits, frame: usize) -> Result<Array2<f32>, FormatError> {
     let mut reader = formats::open_stack(path, limits)?;
-    let mut found = reader.next_frame()?;
+    let mut current = reader.next_frame()?;
     for _ in 1..frame {
-        found = reader.next_frame()?;
+        current = reader.next_frame()?;
     }
-    let gone = || FormatError::io("read the frame")(ErrorKind::UnexpectedEof.into());
-    found.ok_or_else(gone)
+    current.ok_or_else(|| FormatError::io("read the frame")(ErrorKind::UnexpectedEof.into()))
 }
 
-fn first(window: Array3<f32>) -> Array2<f32> {
+fn first_frame(window: Array3<f32>) -> Array2<f32> {
     window.index_axis_move(Axis(0), 0)
 }
 
-/// A window of a preview as large as the frames: every pixel has the value of its place, of a mosaic that of its
-/// sub-image.
-fn enlarged(
+/// A window of the preview, enlarged to the size of the frames without interpolation. In a mosaic, each pixel has the value
+/// of its sub-image.
+fn enlarge_preview(
     path: &Path,
     stack: &Stack,
     frames: Range<usize>,
@@ -297,51 +310,54 @@ fn enlarged(
 ) -> Window {
     let (_, height, width) = stack.shape;
     let step = if stack.mosaic.is_some() { 2 } else { 1 };
-    let from = |at: usize, length: usize, coarse: usize| {
-        at / step * (coarse / step) / (length / step) * step + at % step
+    let coarse_index = |index: usize, length: usize, coarse_length: usize| {
+        index / step * (coarse_length / step) / (length / step) * step + index % step
     };
     let reader = planar::Reader::open(path, &Limits::default())?;
     let (h, w) = (reader.info().height, reader.info().width);
     let size = (frames.len(), rows.len(), columns.len());
     let coarse = reader.read_window(frames, 0..h, 0..w)?;
     Ok(Array3::from_shape_fn(size, |(k, i, j)| {
-        coarse[[k, from(rows.start + i, height, h), from(columns.start + j, width, w)]]
+        let row = coarse_index(rows.start + i, height, h);
+        coarse[[k, row, coarse_index(columns.start + j, width, w)]]
     }))
 }
 
-/// Lays the tiles that are done over a window of a picture. Where they overlap the later one counts:
-/// they are blended when all are done.
-fn lay(
-    tiles: &[DoneTile],
+/// Copies the finished tiles into a window of the picture. Where tiles overlap, the last one wins: they are blended when
+/// the frames are assembled.
+fn overlay_tiles(
+    tiles: &[FinishedTile],
     frames: Range<usize>,
     rows: Range<usize>,
     columns: Range<usize>,
-    whole: &mut Array3<f32>,
+    window: &mut Array3<f32>,
 ) -> Result<(), FormatError> {
     for tile in tiles {
         let step = tile.step;
-        // From the first pixel that both have.
-        let common = |shown: &Range<usize>, has: &Range<usize>| {
-            let before = shown.start.saturating_sub(has.start).next_multiple_of(step);
-            has.start + before..shown.end.min(has.end)
+        // The first common pixel must be one that the tile has.
+        let common = |window: &Range<usize>, tile: &Range<usize>| {
+            let skipped = window.start.saturating_sub(tile.start).next_multiple_of(step);
+            tile.start + skipped..window.end.min(tile.end)
         };
-        let (down, across) = (common(&rows, &tile.rows), common(&columns, &tile.columns));
-        if down.is_empty() || across.is_empty() {
+        let (common_rows, common_columns) =
+            (common(&rows, &tile.rows), common(&columns, &tile.columns));
+        if common_rows.is_empty() || common_columns.is_empty() {
             continue;
         }
-        let of_tile = |part: &Range<usize>, has: &Range<usize>| {
-            (part.start - has.start) / step..(part.end - has.start).div_ceil(step)
+        let in_tile = |common: &Range<usize>, tile: &Range<usize>| {
+            (common.start - tile.start) / step..(common.end - tile.start).div_ceil(step)
         };
-        let part = planar::Reader::open(&tile.path, &Limits::default())?.read_window(
-            tile.first + frames.start..tile.first + frames.end,
-            of_tile(&down, &tile.rows),
-            of_tile(&across, &tile.columns),
+        let values = planar::Reader::open(&tile.path, &Limits::default())?.read_window(
+            tile.first_frame + frames.start..tile.first_frame + frames.end,
+            in_tile(&common_rows, &tile.rows),
+            in_tile(&common_columns, &tile.columns),
         )?;
-        let shown =
-            |part: &Range<usize>, of: &Range<usize>| part.start - of.start..part.end - of.start;
-        let (down, across, step) =
-            (shown(&down, &rows), shown(&across, &columns), step.cast_signed());
-        whole.slice_mut(s![.., down;step, across;step]).assign(&part);
+        let in_window = |common: &Range<usize>, window: &Range<usize>| {
+            common.start - window.start..common.end - window.start
+        };
+        let (down, across) = (in_window(&common_rows, &rows), in_window(&common_columns, &columns));
+        let step = step.cast_signed();
+        window.slice_mut(s![.., down;step, across;step]).assign(&values);
     }
     Ok(())
 }
@@ -350,7 +366,7 @@ fn lay(
 mod tests {
     use std::sync::Arc;
 
-    use super::{DoneTile, Files, Mosaic, Stack, Unfinished};
+    use super::{Files, FinishedTile, Mosaic, Stack, Unfinished};
     use formats::{npy, planar};
     use ndarray::{Array3, s};
 
@@ -369,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn the_residual_is_what_the_frames_leave_of_the_measurement() {
+    fn the_residual_is_the_unexplained_part_of_the_measurement() {
         let folder = tempfile::tempdir().unwrap();
         let value = |k: usize, i: usize, j: usize| ((k * 31 + i * 7 + j * 3) % 11) as f32 / 10.0;
         let x = Array3::from_shape_fn((3, 20, 24), |(k, i, j)| value(k, i, j));
@@ -377,68 +393,69 @@ mod tests {
         let mut y = (&x * &masks).sum_axis(ndarray::Axis(0));
         y[[4, 5]] -= 0.25;
         let y = y.insert_axis(ndarray::Axis(0));
-        let files = |name, of: &Array3<f32>| Files::Prepared(prepared(folder.path(), name, of));
+        let files =
+            |name, values: &Array3<f32>| Files::Prepared(prepared(folder.path(), name, values));
         let frames = stack((3, 20, 24), files("x", &x));
         let masks = stack((3, 20, 24), files("masks", &masks));
         let picture = frames.residual(&masks, &stack((1, 20, 24), files("y", &y)), 0);
-        let found = picture.reduce(&picture.whole(0)).unwrap();
-        for ((i, j), &rest) in found.indexed_iter() {
+        let residual = picture.reduce(&picture.whole(0)).unwrap();
+        for ((i, j), &value) in residual.indexed_iter() {
             let expected = if (i, j) == (4, 5) { 0.25 } else { 0.0 };
-            assert!((rest - expected).abs() < 1e-5, "{i} {j} {rest}");
+            assert!((value - expected).abs() < 1e-5, "{i} {j} {value}");
         }
         let slice = frames.slice(7);
-        let found = slice.reduce(&slice.whole(0)).unwrap();
-        assert_eq!(found, x.slice(s![.., 7, ..]));
+        assert_eq!(slice.reduce(&slice.whole(0)).unwrap(), x.slice(s![.., 7, ..]));
         let change = frames.difference(2);
-        let found = change.reduce(&change.whole(0)).unwrap();
-        assert_eq!(found, &x.slice(s![2, .., ..]) - &x.slice(s![1, .., ..]));
+        let values = change.reduce(&change.whole(0)).unwrap();
+        assert_eq!(values, &x.slice(s![2, .., ..]) - &x.slice(s![1, .., ..]));
     }
 
     #[test]
     fn an_unfinished_mosaic_is_shown_in_the_colours_of_the_finished_one() {
         let folder = tempfile::tempdir().unwrap();
         let mosaic = Mosaic::Grbg;
-        let seen =
+        let raw =
             Array3::from_shape_fn((2, 16, 20), |(k, i, j)| ((k * 320 + i * 20 + j) as f32).sin());
         let mut colours = Array3::zeros((2, 16, 60));
-        for (seen, mut colours) in seen.outer_iter().zip(colours.outer_iter_mut()) {
-            colours.assign(&mosaic.demosaick(seen, (0, 0)));
+        for (raw, mut colours) in raw.outer_iter().zip(colours.outer_iter_mut()) {
+            colours.assign(&mosaic.demosaick(raw, (0, 0)));
         }
         let array = folder.path().join("frames.npy");
         npy::write_colours(&array, colours.view()).unwrap();
-        // A preview of one pixel for each colour, and all tiles: each a sub-image.
-        let coarse = Array3::from_shape_fn((2, 2, 2), |(k, i, j)| seen[[k, i, j]]);
+        // The preview has one pixel for each colour. Each tile is a sub-image.
+        let coarse = Array3::from_shape_fn((2, 2, 2), |(k, i, j)| raw[[k, i, j]]);
         let preview = Some(prepared(folder.path(), "preview", &coarse));
         let tile = |plane: usize| {
             let (row, column) = (plane / 2, plane % 2);
-            let part = seen.slice(s![.., row..;2, column..;2]).to_owned();
+            let part = raw.slice(s![.., row..;2, column..;2]).to_owned();
             let path = prepared(folder.path(), &format!("tile {plane}"), &part);
-            DoneTile { rows: row..15 + row, columns: column..19 + column, step: 2, first: 0, path }
+            let (rows, columns) = (row..15 + row, column..19 + column);
+            FinishedTile { rows, columns, step: 2, first_frame: 0, path }
         };
         let unfinished =
             |tiles| Files::Tiles(Arc::new(Unfinished { preview: preview.clone(), tiles }));
-        let of = |files| Stack { mosaic: Some(mosaic), ..stack((2, 16, 20), files) };
-        let (done, all) = (of(Files::Frames(array)), of(unfinished((0..4).map(tile).collect())));
+        let mosaic_stack = |files| Stack { mosaic: Some(mosaic), ..stack((2, 16, 20), files) };
+        let assembled = mosaic_stack(Files::Frames(array));
+        let all_tiles = mosaic_stack(unfinished((0..4).map(tile).collect()));
         for (rows, columns) in [(0..16, 0..20), (3..9, 5..8), (7..8, 0..20)] {
             let window = |stack: &Stack| stack.window(0..2, rows.clone(), columns.clone()).unwrap();
             let place = s![.., rows.clone(), 3 * columns.start..3 * columns.end];
-            assert_eq!(window(&done), colours.slice(place));
-            assert_eq!(window(&all), colours.slice(place));
-            let sensor = |stack: &Stack| stack.seen(0..2, rows.clone(), columns.clone()).unwrap();
+            assert_eq!(window(&assembled), colours.slice(place));
+            assert_eq!(window(&all_tiles), colours.slice(place));
+            let sensor = |stack: &Stack| stack.raw(0..2, rows.clone(), columns.clone()).unwrap();
             let place = s![.., rows.clone(), columns.clone()];
-            assert_eq!(
-                (sensor(&done), sensor(&all)),
-                (seen.slice(place).to_owned(), seen.slice(place).to_owned())
-            );
+            assert_eq!(sensor(&assembled), raw.slice(place));
+            assert_eq!(sensor(&all_tiles), raw.slice(place));
         }
-        let begun = of(unfinished(Vec::new())).seen(0..1, 0..16, 0..20).unwrap();
-        assert_eq!((begun[[0, 14, 18]], begun[[0, 9, 3]]), (coarse[[0, 0, 0]], coarse[[0, 1, 1]]));
-        let picture = done.frame(1);
+        let no_tiles = mosaic_stack(unfinished(Vec::new())).raw(0..1, 0..16, 0..20).unwrap();
+        assert_eq!(no_tiles[[0, 14, 18]], coarse[[0, 0, 0]]);
+        assert_eq!(no_tiles[[0, 9, 3]], coarse[[0, 1, 1]]);
+        let picture = assembled.frame(1);
         assert_eq!(picture.reduce(&picture.whole(0)).unwrap(), colours.slice(s![1, .., ..]));
     }
 
     #[test]
-    fn tiles_that_are_done_stand_in_their_place_on_the_preview() {
+    fn finished_tiles_are_shown_on_the_preview() {
         let folder = tempfile::tempdir().unwrap();
         let x = Array3::from_shape_fn((2, 40, 40), |(k, i, j)| (k * 1600 + i * 40 + j) as f32);
         let part = x.slice(s![.., 16..40, 20..40]).to_owned();
@@ -447,18 +464,18 @@ mod tests {
         let coarse_path = prepared(folder.path(), "preview", &coarse);
         for preview in [None, Some(coarse_path)] {
             let below = |i: usize, j: usize| preview.as_ref().map(|_| coarse[[1, i / 8, j / 8]]);
-            let tiles = vec![DoneTile {
+            let tiles = vec![FinishedTile {
                 rows: 16..40,
                 columns: 20..40,
                 step: 1,
-                first: 0,
+                first_frame: 0,
                 path: path.clone(),
             }];
             let unfinished = Unfinished { preview: preview.clone(), tiles };
             let picture = stack((2, 40, 40), Files::Tiles(Arc::new(unfinished))).frame(1);
             assert!(!picture.settled);
-            let found = picture.reduce(&picture.whole(0)).unwrap();
-            for ((i, j), &value) in found.indexed_iter() {
+            let values = picture.reduce(&picture.whole(0)).unwrap();
+            for ((i, j), &value) in values.indexed_iter() {
                 let expected = (i >= 16 && j >= 20).then_some(x[[1, i, j]]).or(below(i, j));
                 assert_eq!(value.is_finite().then_some(value), expected, "{i} {j}");
             }

@@ -1,4 +1,4 @@
-//! Reduced pictures that were asked for lately, so that no stack is read twice for one thumbnail.
+//! A cache of reduced pictures, so that a stack is not read again for each thumbnail or change of contrast.
 
 use std::io::ErrorKind;
 use std::sync::Arc;
@@ -13,24 +13,25 @@ use crate::http::error::{ApiError, Code, Result};
 use formats::FormatError;
 
 /// Memory for reduced pictures, in bytes.
-const BUDGET: u64 = 64 << 20;
-/// Pictures that are reduced at the same time: the cores are for the workers.
-const AT_ONCE: usize = 2;
+const CACHE_BYTES: u64 = 64 << 20;
+/// Pictures that are reduced at the same time. The limit leaves the other cores to the workers.
+const CONCURRENT_REDUCTIONS: usize = 2;
 
 type Key = (String, Region);
 type Values = Arc<Array2<f32>>;
 
-/// Reduces pictures, each of them once for all who ask for it.
+/// Reduces pictures and caches them. Concurrent requests for the same region share one reduction.
 #[derive(Debug)]
 pub(in crate::http) struct Pictures {
-    reduced: Cache<Key, Values, Bytes>,
-    turns: Semaphore,
+    reduced: Cache<Key, Values, SizeInBytes>,
+    permits: Semaphore,
 }
 
+/// Weighs cached values by their size in bytes.
 #[derive(Debug, Clone)]
-struct Bytes;
+struct SizeInBytes;
 
-impl Weighter<Key, Values> for Bytes {
+impl Weighter<Key, Values> for SizeInBytes {
     fn weight(&self, _: &Key, values: &Values) -> u64 {
         (values.len() * size_of::<f32>()) as u64
     }
@@ -38,27 +39,28 @@ impl Weighter<Key, Values> for Bytes {
 
 impl Pictures {
     pub(in crate::http) fn new() -> Self {
-        // One shard: in one of many the largest pictures would find no room. Half is for what was
-        // asked for once: a screen of tiles is looked at again with another contrast.
+        // With several shards, the largest pictures would exceed the share of one. Half of the memory is for pictures
+        // that were requested once: a viewer requests all tiles of a screen again when the contrast changes.
         let options = OptionsBuilder::new()
             .shards(1)
             .estimated_items_capacity(1024)
-            .weight_capacity(BUDGET)
+            .weight_capacity(CACHE_BYTES)
             .hot_allocation(0.5)
             .build();
-        // The options are complete, so this can't fail.
+        // `build` fails only if an option is missing; all are given.
         let reduced = match options {
             Ok(options) => Cache::with_options(
                 options,
-                Bytes,
+                SizeInBytes,
                 DefaultHashBuilder::default(),
                 DefaultLifecycle::default(),
             ),
-            Err(_) => Cache::with_weighter(1024, BUDGET, Bytes),
+            Err(_) => Cache::with_weighter(1024, CACHE_BYTES, SizeInBytes),
         };
-        Self { reduced, turns: Semaphore::new(AT_ONCE) }
+        Self { reduced, permits: Semaphore::new(CONCURRENT_REDUCTIONS) }
     }
 
+    /// The values of a region of a picture, as [`Picture::reduce`] gives them.
     pub(in crate::http) async fn reduced(
         &self,
         picture: Arc<Picture>,
@@ -67,7 +69,7 @@ impl Pictures {
         let key = (picture.identity.clone(), region.clone());
         let reduce = async {
             let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
-            let _turn = self.turns.acquire().await.map_err(stopped)?;
+            let _permit = self.permits.acquire().await.map_err(stopped)?;
             let reduce = tokio::task::spawn_blocking(move || picture.reduce(&region));
             let values = reduce.await.map_err(|error| ApiError::internal(&error))?;
             Ok(Arc::new(values.map_err(unreadable)?))
@@ -76,11 +78,11 @@ impl Pictures {
     }
 }
 
-/// A file that is gone was one of the tiles that have just been put together.
+/// Maps a missing file to 404: it was a tile of a snapshot that has just been assembled.
 fn unreadable(error: FormatError) -> ApiError {
     match error {
         FormatError::Io { source, .. } if source.kind() == ErrorKind::NotFound => {
-            ApiError::new(Code::NotReady, "the frames are being put together; ask again")
+            ApiError::new(Code::NotReady, "the frames are being assembled; try again")
         }
         error => error.into(),
     }
@@ -91,7 +93,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
-    use super::{BUDGET, Pictures};
+    use super::{CACHE_BYTES, Pictures};
     use crate::http::rendering::Picture;
     use formats::Channels;
     use ndarray::Array2;
@@ -116,25 +118,25 @@ mod tests {
     #[tokio::test]
     async fn a_picture_is_read_once_and_memory_is_bounded() {
         let (pictures, reads) = (Pictures::new(), Arc::new(AtomicUsize::new(0)));
-        let ask = async |name| {
+        let request = async |name| {
             let picture = picture(name, &reads);
             let whole = picture.whole(0);
             pictures.reduced(picture, whole).await.unwrap().len()
         };
-        let both = tokio::join!(ask(0), ask(0));
+        let both = tokio::join!(request(0), request(0));
         assert_eq!(both, (1 << 20, 1 << 20));
-        assert_eq!(reads.load(Ordering::Relaxed), 1, "who asks at the same time waits");
+        assert_eq!(reads.load(Ordering::Relaxed), 1, "concurrent requests share a read");
         for name in 0..40 {
-            ask(name).await;
+            request(name).await;
         }
-        let held = pictures.reduced.weight();
-        assert!(held <= BUDGET && held > BUDGET / 2, "{held}");
-        // Sixteen of them fit.
-        let before = reads.load(Ordering::Relaxed);
+        let cached_bytes = pictures.reduced.weight();
+        assert!(cached_bytes <= CACHE_BYTES && cached_bytes > CACHE_BYTES / 2, "{cached_bytes}");
+        // Sixteen pictures fit into the cache.
+        let first_reads = reads.load(Ordering::Relaxed);
         for name in 0..40 {
-            ask(name).await;
+            request(name).await;
         }
-        let again = reads.load(Ordering::Relaxed) - before;
-        assert!((24..=40).contains(&again), "{again} of 40 pictures were read again");
+        let repeated = reads.load(Ordering::Relaxed) - first_reads;
+        assert!((24..=40).contains(&repeated), "{repeated} of 40 pictures were read again");
     }
 }

@@ -1,7 +1,7 @@
-//! Windows of large pictures, reduced for display. Knows neither jobs nor requests.
+//! Reads regions of large pictures, reduced for display. Independent of jobs and of HTTP.
 
 mod cache;
 mod render;
 
 pub(super) use cache::Pictures;
-pub(super) use render::{Picture, Region, TILE, spread};
+pub(super) use render::{Picture, Region, Spread, TILE, spread};

@@ -1,4 +1,4 @@
-//! The next piece of an upload: from the network to the disk, a few chunks in memory.
+//! Receives a piece of an upload and appends it to the file. Memory holds a few chunks at a time.
 
 use axum::body::{Body, Bytes};
 use tokio::sync::mpsc;
@@ -10,8 +10,9 @@ use crate::http::error::{ApiError, Code, Result};
 use crate::http::upload::{CHUNKS, Pace, next};
 use store::{PartialFile, StoreError};
 
-/// Appends what comes. A cut connection keeps what has come before it, unless a checksum was named
-/// for the piece: then all of the piece counts, or nothing. The file stays locked until its row says so.
+/// Appends the body to the file. If the connection breaks, the bytes received until then are kept. A piece with a
+/// checksum is kept only if it is complete and the checksum matches. The file stays locked until the database has the
+/// new offset.
 pub(super) async fn append(
     app: &App,
     file: PartialFile,
@@ -19,16 +20,17 @@ pub(super) async fn append(
     checksum: Option<Checksum>,
     body: Body,
 ) -> Result<PartialFile> {
-    let whole = checksum.is_some();
-    let (length, received) = (file.upload().facts.length, file.upload().received);
+    let has_checksum = checksum.is_some();
+    let length = file.upload().facts.length;
+    let remaining = length - file.upload().received;
     let (sender, receiver) = mpsc::channel(CHUNKS);
     let writer = tokio::task::spawn_blocking(move || write(file, receiver, checksum));
-    let pumped = pump(app, &mut room, (length, length - received), body, sender).await;
+    let transfer = forward_chunks(app, &mut room, length, remaining, body, sender).await;
     let mut written = writer.await.map_err(|_| StoreError::Interrupted)??;
-    match (&pumped, written.sum_holds) {
-        (Err(_), _) if whole => {}
+    match (&transfer, written.checksum_matches) {
+        (Err(_), _) if has_checksum => {}
         (Ok(()), Some(false)) => {
-            let detail = "the bytes that came have another checksum; send the piece again";
+            let detail = "the received bytes do not match the checksum; send the piece again";
             return Err(ApiError::new(Code::ChecksumMismatch, detail));
         }
         _ => {
@@ -38,27 +40,30 @@ pub(super) async fn append(
             metrics::counter!("sci_recon_upload_bytes_total").increment(written.bytes);
         }
     }
-    pumped.map(|()| written.file)
+    transfer.map(|()| written.file)
 }
 
-/// Hands the chunks of the body on, no more than the upload still wants.
-async fn pump(
+/// Passes the chunks of the body to the writer. `remaining` is the number of bytes that the upload still needs.
+///
+/// Errors: 413 if the body is longer.
+async fn forward_chunks(
     app: &App,
     room: &mut Reservation,
-    (length, mut left): (u64, u64),
+    length: u64,
+    mut remaining: u64,
     body: Body,
     sender: mpsc::Sender<Bytes>,
 ) -> Result<()> {
     let mut stream = body.into_data_stream();
     let mut pace = Pace::default();
     while let Some(chunk) = next(app, &mut pace, &mut stream).await? {
-        let Some(rest) = left.checked_sub(chunk.len() as u64) else {
-            let detail = format!("the upload was begun with a length of {length}");
+        let Some(rest) = remaining.checked_sub(chunk.len() as u64) else {
+            let detail = format!("the upload was created with {length} bytes; the body is longer");
             return Err(ApiError::new(Code::TooLarge, detail));
         };
-        left = rest;
+        remaining = rest;
         app.admission.take(room, chunk.len() as u64).await?;
-        // A writer that takes no more has failed, and says why itself.
+        // A closed channel means that the writer failed. The caller reports the writer's error.
         if sender.send(chunk).await.is_err() {
             break;
         }
@@ -68,8 +73,10 @@ async fn pump(
 
 struct Written {
     file: PartialFile,
+    /// Number of bytes that were appended.
     bytes: u64,
-    sum_holds: Option<bool>,
+    /// `None` for a piece without a checksum.
+    checksum_matches: Option<bool>,
 }
 
 fn write(
@@ -86,5 +93,5 @@ fn write(
         }
     }
     file.sync()?;
-    Ok(Written { file, bytes, sum_holds: checksum.map(Checksum::holds) })
+    Ok(Written { file, bytes, checksum_matches: checksum.map(Checksum::matches) })
 }

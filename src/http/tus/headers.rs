@@ -1,4 +1,4 @@
-//! What clients say in headers of tus 1.0. Nothing here trusts any of it.
+//! Parses the headers of tus 1.0. All input is untrusted.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -6,13 +6,15 @@ use sha1::Digest;
 
 use engine::job::Sha256;
 
-/// The longest `Upload-Metadata` that is kept.
+/// Longest accepted `Upload-Metadata`, in bytes.
 const MAX_METADATA: usize = 4096;
 
-/// The algorithms of `Upload-Checksum` that are known.
+/// Supported algorithms of `Upload-Checksum`.
 pub const ALGORITHMS: &str = "sha1,sha256";
 
-/// The pairs of an `Upload-Metadata`: names, and values that are any bytes.
+/// Splits an `Upload-Metadata` into pairs of a name and decoded bytes.
+///
+/// Errors: the header is too long, repeats a name, or has a value that is not base64.
 pub fn metadata(text: &str) -> Result<Vec<(&str, Vec<u8>)>, String> {
     if text.len() > MAX_METADATA {
         return Err(format!("Upload-Metadata has {} bytes, more than {MAX_METADATA}", text.len()));
@@ -20,7 +22,7 @@ pub fn metadata(text: &str) -> Result<Vec<(&str, Vec<u8>)>, String> {
     let mut pairs: Vec<(&str, Vec<u8>)> = Vec::new();
     for pair in text.split(',').map(str::trim).filter(|pair| !pair.is_empty()) {
         let (name, value) = pair.split_once(' ').unwrap_or((pair, ""));
-        if pairs.iter().any(|(known, _)| *known == name) {
+        if pairs.iter().any(|(existing, _)| *existing == name) {
             return Err(format!("Upload-Metadata has {name:?} twice"));
         }
         let value = STANDARD.decode(value.trim());
@@ -30,7 +32,7 @@ pub fn metadata(text: &str) -> Result<Vec<(&str, Vec<u8>)>, String> {
     Ok(pairs)
 }
 
-/// A running checksum and what it should come to.
+/// A running checksum and its expected value.
 #[derive(Debug)]
 pub struct Checksum {
     hasher: Hasher,
@@ -44,9 +46,9 @@ enum Hasher {
 }
 
 impl Checksum {
-    /// From an `Upload-Checksum`: the algorithm, a space, and the checksum in base64.
+    /// Parses an `Upload-Checksum`: the algorithm, a space, and the checksum in base64.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let form = || "Upload-Checksum must be sha1 or sha256, a space, and the sum in base64";
+        let form = || "Upload-Checksum must be sha1 or sha256, a space, and the checksum in base64";
         let (name, value) = text.split_once(' ').ok_or_else(form)?;
         let (hasher, length) = match name {
             "sha1" => (Hasher::Sha1(sha1::Sha1::new()), 20),
@@ -60,12 +62,12 @@ impl Checksum {
         Ok(Self { hasher, expected })
     }
 
-    /// The SHA-256 that the bytes should have.
+    /// A SHA-256 with this expected value.
     pub fn sha256(expected: Sha256) -> Self {
         Self { hasher: Hasher::Sha256(sha2::Sha256::new()), expected: expected.bytes().to_vec() }
     }
 
-    /// Goes on with these bytes.
+    /// Adds bytes to the checksum.
     pub fn update(&mut self, bytes: &[u8]) {
         match &mut self.hasher {
             Hasher::Sha1(hasher) => hasher.update(bytes),
@@ -73,8 +75,8 @@ impl Checksum {
         }
     }
 
-    /// True if all bytes together have the checksum that they should have.
-    pub fn holds(self) -> bool {
+    /// True if the checksum of all added bytes has the expected value.
+    pub fn matches(self) -> bool {
         match self.hasher {
             Hasher::Sha1(hasher) => hasher.finalize()[..] == self.expected[..],
             Hasher::Sha256(hasher) => hasher.finalize()[..] == self.expected[..],
@@ -87,7 +89,7 @@ mod tests {
     use super::{Checksum, metadata};
 
     #[test]
-    fn metadata_are_names_and_values() {
+    fn metadata_are_split_into_names_and_values() {
         let pairs = metadata("filename bWFza3MubnB5,flag, sha256  YWJj").unwrap();
         let masks = b"masks.npy".to_vec();
         assert_eq!(pairs, [("filename", masks), ("flag", vec![]), ("sha256", b"abc".to_vec())]);
@@ -98,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn checksums_hold_or_do_not() {
+    fn checksums_match_only_the_right_bytes() {
         for text in [
             "sha1 qZk+NkcGgWq6PiVxeFDCbJzQ2J0=",
             "sha256 ungWv48Bz+pBQUDeXa4iI7ADYaOWF3qctBD/YfIAFa0=",
@@ -106,10 +108,10 @@ mod tests {
             let mut good = Checksum::parse(text).unwrap();
             good.update(b"a");
             good.update(b"bc");
-            assert!(good.holds());
+            assert!(good.matches());
             let mut bad = Checksum::parse(text).unwrap();
             bad.update(b"abd");
-            assert!(!bad.holds());
+            assert!(!bad.matches());
         }
         for bad in
             ["", "sha1", "md5 qZk=", "sha1 qZk=", "sha1 ***", "sha256 qZk+NkcGgWq6PiVxeFDCbJzQ2J0="]

@@ -1,7 +1,7 @@
-//! `/v1/uploads`: uploads in pieces, by tus 1.0 (core, creation, checksum, expiration, termination).
+//! `/v1/uploads`: resumable uploads by tus 1.0 (core, creation, checksum, expiration, termination).
 //!
-//! `tus-protocol` 0.1 leaves storage, state, locks and hooks to the caller. Here the offset, the quotas and the
-//! disk reservation share one database, so all four would be this code again; the protocol is four handlers.
+//! The crate `tus-protocol` 0.1 leaves storage, state, locks and hooks to its caller, and these are most of the code
+//! below. The protocol alone is four handlers, so the crate is not used.
 
 mod append;
 pub mod headers;
@@ -22,7 +22,7 @@ use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, re
 use super::listen::Cut;
 use super::page::{Cursor, Limit, PageBody};
 use engine::job::{Lab, PartialId, Sha256, Timestamp};
-use store::{FIRST_RESERVE, FoundPartial, Inserted, Made, NewPartial, Partial, PartialFile};
+use store::{FIRST_RESERVE, FoundPartial, Made, NewPartial, Partial, PartialFile};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -33,7 +33,7 @@ const EXPIRES: HeaderName = HeaderName::from_static("upload-expires");
 const VERSION: HeaderValue = HeaderValue::from_static("1.0.0");
 
 /// Rewrites a request by the rules of tus. `X-HTTP-Method-Override` replaces the method, for clients that can send only
-/// POST. A trailing slash of the address of all uploads is ignored.
+/// POST. The trailing slash of `/v1/uploads/` is removed.
 pub(super) fn rewrite(mut request: Request) -> Request {
     let path = request.uri().path();
     if path == "/v1/uploads/" {
@@ -43,19 +43,19 @@ pub(super) fn rewrite(mut request: Request) -> Request {
             request.extensions_mut().insert(OriginalUri(original));
         }
     } else if path.starts_with("/v1/uploads/") && *request.method() == Method::POST {
-        let meant = request.headers().get("x-http-method-override");
-        let meant = meant.and_then(|name| Method::from_bytes(name.as_bytes()).ok());
-        *request.method_mut() = meant.unwrap_or(Method::POST);
+        let name = request.headers().get("x-http-method-override");
+        let method = name.and_then(|name| Method::from_bytes(name.as_bytes()).ok());
+        *request.method_mut() = method.unwrap_or(Method::POST);
     }
     request
 }
 
-/// Speaks version 1.0.0 alone, and says so in every answer.
+/// Rejects requests of other versions than 1.0.0, and adds the version to every answer.
 pub(super) async fn version(request: Request, next: Next) -> Response {
-    let spoken = request.headers().get(&RESUMABLE);
-    // The list of uploads is none of tus.
-    let is_free = matches!(*request.method(), Method::OPTIONS | Method::GET);
-    let mut response = if spoken == Some(&VERSION) || is_free {
+    let requested = request.headers().get(&RESUMABLE);
+    // GET lists uploads and is no part of tus; OPTIONS is how a client learns the version.
+    let is_exempt = matches!(*request.method(), Method::OPTIONS | Method::GET);
+    let mut response = if requested == Some(&VERSION) || is_exempt {
         next.run(request).await
     } else {
         let detail = "the header Tus-Resumable must be 1.0.0";
@@ -107,7 +107,7 @@ async fn current(app: &App, lab: &Lab, id: PartialId) -> Result<UploadBody> {
     Ok(app.store.partial(lab, id).await?.into())
 }
 
-/// `GET /v1/uploads`: those that have begun, newest first.
+/// `GET /v1/uploads`: the lab's uploads, newest first.
 pub(super) async fn list(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<ListQuery>,
@@ -118,7 +118,7 @@ pub(super) async fn list(
     PageBody::new(page, |upload: &Partial| upload.id.to_string(), UploadBody::from).answer(&request)
 }
 
-/// `OPTIONS /v1/uploads`: what this service can do.
+/// `OPTIONS /v1/uploads`: the supported version, extensions, checksums and size.
 pub(super) async fn options(State(app): State<App>) -> Response {
     let fields = [
         ("tus-version", "1.0.0".to_owned()),
@@ -129,7 +129,7 @@ pub(super) async fn options(State(app): State<App>) -> Response {
     (StatusCode::NO_CONTENT, fields).into_response()
 }
 
-/// `POST /v1/uploads`: begins an upload.
+/// `POST /v1/uploads`: creates an upload.
 pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> Result<Response> {
     if headers.contains_key("upload-concat") {
         let detail = "uploads are not concatenated: send the file as one upload (parallelUploads: 1 in tus-js-client)";
@@ -145,70 +145,76 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
         return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
     }
     let metadata = text(&headers, &METADATA)?.unwrap_or_default();
-    let expected = expected(metadata).map_err(malformed)?;
+    let expected = expected_sha256(metadata).map_err(malformed)?;
     let key = request_key(&headers, &(length, metadata))?;
     if let Some(id) = app.store.made_with(&access.lab, Made::Upload, key.as_ref()).await? {
-        return begun(&app, &access.lab, Inserted::Before(id)).await;
+        return created(&app, &access.lab, id).await;
     }
     app.admission.check_length(&access, length).await?;
     let Access { lab, token, .. } = access;
     let facts =
         NewPartial { lab: lab.clone(), token, length, metadata: metadata.to_owned(), expected };
-    // More is reserved as it grows.
+    // The reservation is extended while the upload grows.
     let first = length.min(FIRST_RESERVE);
-    let begin = app.store.begin_partial(facts, app.settings.upload_age(), key.as_ref());
-    let inserted = app.admission.with_room(&lab, ("the upload", first), begin).await?;
-    begun(&app, &lab, inserted).await
+    let insert = app.store.begin_partial(facts, app.settings.upload_age(), key.as_ref());
+    let inserted = app.admission.with_room(&lab, ("the upload", first), insert).await?;
+    created(&app, &lab, inserted.id()).await
 }
 
-/// The answer to a request that has begun an upload, or had begun it before: where its pieces go. It is
-/// 201 in any case, which is what clients of tus expect.
-async fn begun(app: &App, lab: &Lab, inserted: Inserted<PartialId>) -> Result<Response> {
-    let upload = app.store.partial(lab, inserted.id()).await?;
+/// The answer to a request that created an upload, with the address for its pieces. A repeated request with the same
+/// key also gets 201, because clients of tus accept no other status.
+async fn created(app: &App, lab: &Lab, id: PartialId) -> Result<Response> {
+    let upload = app.store.partial(lab, id).await?;
     let location = [(header::LOCATION, format!("/v1/uploads/{}", upload.id))];
-    Ok((StatusCode::CREATED, location, state(&upload)).into_response())
+    Ok((StatusCode::CREATED, location, state_headers(&upload)).into_response())
 }
 
-/// The hash of the whole file, if the metadata name it.
-fn expected(metadata: &str) -> Result<Option<Sha256>, String> {
+/// The hash of the whole file, if the metadata have the key `sha256`.
+fn expected_sha256(metadata: &str) -> Result<Option<Sha256>, String> {
     let pairs = headers::metadata(metadata)?;
     let Some((_, value)) = pairs.into_iter().find(|(name, _)| *name == "sha256") else {
         return Ok(None);
     };
-    let text = String::from_utf8(value).map_err(|_| "the metadata's sha256 is no text")?;
+    let text = String::from_utf8(value).map_err(|_| "sha256 in Upload-Metadata is not text")?;
     text.parse().map(Some).map_err(|error: engine::job::InvalidText| error.to_string())
 }
 
-/// `HEAD /v1/uploads/{upload}`: how far it is.
+/// `HEAD /v1/uploads/{upload}`: the number of bytes received.
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<PartialId>,
 ) -> Result<Response> {
     let mut upload = app.store.partial(&access.lab, id).await?;
-    // All has come, but not the end of its request; or bytes on record are lost, which is told here.
+    // If the connection broke after the last byte, the upload is finished here. If the file is shorter than the offset,
+    // opening it fails with an error for the client.
     if upload.result.is_none()
         && (upload.received == upload.facts.length
             || app.store.partial_bytes(id).await? < upload.received)
     {
-        upload = to_the_end(async move {
+        upload = run_detached(async move {
             match app.store.open_partial(&access.lab, id).await? {
                 FoundPartial::Open(file) => finish(&app, file).await,
-                FoundPartial::Stored(upload) => Ok(upload),
+                FoundPartial::Stored(stored) => Ok(stored),
                 FoundPartial::Busy => Ok(upload),
             }
         })
         .await?;
     }
     let length = upload.facts.length.to_string();
-    let about = [(LENGTH, length), (METADATA, upload.facts.metadata.clone())];
-    let about = about.into_iter().filter(|(_, value)| !value.is_empty());
+    let facts = [(LENGTH, length), (METADATA, upload.facts.metadata.clone())];
+    let facts = facts.into_iter().filter(|(_, value)| !value.is_empty());
     let cache = [(header::CACHE_CONTROL, "no-store")];
     let etag = [(header::ETAG, conditional::etag_of(&UploadBody::from(upload.clone()))?)];
-    Ok((cache, etag, state(&upload), axum::response::AppendHeaders(about.collect::<Vec<_>>()))
+    Ok((
+        cache,
+        etag,
+        state_headers(&upload),
+        axum::response::AppendHeaders(facts.collect::<Vec<_>>()),
+    )
         .into_response())
 }
 
-/// `PATCH /v1/uploads/{upload}`: the next piece.
+/// `PATCH /v1/uploads/{upload}`: appends a piece.
 pub(super) async fn patch(
     Caller(app, access): Caller,
     Params(id): Params<PartialId>,
@@ -218,13 +224,13 @@ pub(super) async fn patch(
 ) -> Result<Response> {
     drop(request.precondition(&app.changes, current(&app, &access.lab, id)).await?);
     let permit = app.admission.place(&access.lab)?;
-    let upload = to_the_end(async move {
+    let upload = run_detached(async move {
         let _permit = permit;
-        piece(&app, &access, id, &headers, body).await
+        receive_piece(&app, &access, id, &headers, body).await
     });
     match upload.await {
-        Ok(upload) => Ok((StatusCode::NO_CONTENT, state(&upload)).into_response()),
-        // Clients of tus go on after a cut, and give up after 408.
+        Ok(upload) => Ok((StatusCode::NO_CONTENT, state_headers(&upload)).into_response()),
+        // Clients of tus resume after a closed connection, but give up after status 408.
         Err(error) if error.code() == Code::UploadStalled => {
             let mut response = error.into_response();
             response.extensions_mut().insert(Cut);
@@ -234,15 +240,14 @@ pub(super) async fn patch(
     }
 }
 
-/// A task of its own: what has come is recorded also when the connection, and with it the request, is
-/// gone.
-async fn to_the_end<T: Send + 'static>(
+/// Runs the work as a separate task, which completes even if the client disconnects.
+async fn run_detached<T: Send + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<T> {
     tokio::spawn(work).await.map_err(|error| ApiError::internal(&error))?
 }
 
-async fn piece(
+async fn receive_piece(
     app: &App,
     access: &Access,
     id: PartialId,
@@ -267,11 +272,14 @@ async fn piece(
         FoundPartial::Busy => return Err(busy()),
     };
     if offset != upload.received {
-        let detail = format!("{} bytes are here; the piece begins at {offset}", upload.received);
+        let detail = format!(
+            "Upload-Offset is {offset}, but {0} bytes were received: continue at offset {0}",
+            upload.received
+        );
         return Err(ApiError::new(Code::OffsetMismatch, detail));
     }
     let Some(file) = file else { return Ok(upload) };
-    // Of a piece that does not say its length, room is reserved as it comes.
+    // Without Content-Length, space is reserved while the bytes arrive.
     let length = text(headers, &header::CONTENT_LENGTH)?.and_then(|text| text.parse().ok());
     let length: u64 = length.unwrap_or_default();
     let length = length.min(upload.facts.length - upload.received);
@@ -280,7 +288,7 @@ async fn piece(
     finish(app, file).await
 }
 
-/// Stores the file if all of it is there.
+/// Stores the file if it is complete.
 async fn finish(app: &App, file: PartialFile) -> Result<Partial> {
     if file.is_complete() {
         return Ok(app.store.finish_partial(file).await?);
@@ -288,7 +296,7 @@ async fn finish(app: &App, file: PartialFile) -> Result<Partial> {
     Ok(file.upload().clone())
 }
 
-/// `DELETE /v1/uploads/{upload}`: ends it; what has come goes.
+/// `DELETE /v1/uploads/{upload}`: ends the upload and deletes the received bytes.
 pub(super) async fn delete(
     Caller(app, access): Caller,
     Params(id): Params<PartialId>,
@@ -297,21 +305,21 @@ pub(super) async fn delete(
     let _guard = request.precondition(&app.changes, current(&app, &access.lab, id)).await?;
     app.store.partial(&access.lab, id).await?;
     let store = app.store.clone();
-    let deleted = to_the_end(async move { Ok(store.delete_partial(id).await?) });
+    let deleted = run_detached(async move { Ok(store.delete_partial(id).await?) });
     if deleted.await? { Ok(StatusCode::NO_CONTENT) } else { Err(busy()) }
 }
 
-/// How far the upload is, until when it is kept, and, once it is stored, as what.
-fn state(upload: &Partial) -> HeaderMap {
+/// Headers with the offset, the time of expiry, and the blob of a finished upload.
+fn state_headers(upload: &Partial) -> HeaderMap {
     let mut fields = HeaderMap::new();
     fields.insert(OFFSET, upload.received.into());
     if let Ok(expires) = HeaderValue::try_from(upload.expires_at.http_date()) {
         fields.insert(EXPIRES, expires);
     }
-    if let Some(Ok(place)) =
+    if let Some(Ok(address)) =
         upload.result.map(|sha256| HeaderValue::try_from(format!("/v1/blobs/{sha256}")))
     {
-        fields.insert(header::CONTENT_LOCATION, place);
+        fields.insert(header::CONTENT_LOCATION, address);
     }
     fields
 }
@@ -324,7 +332,7 @@ fn text<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Result<Option<&'a str>
 fn number(headers: &HeaderMap, name: &HeaderName) -> Result<u64> {
     let digits = |text: &&str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     let number = text(headers, name)?.filter(digits).and_then(|text| text.parse().ok());
-    // SQLite keeps signed numbers.
+    // SQLite stores signed numbers.
     number
         .filter(|number| i64::try_from(*number).is_ok())
         .ok_or_else(|| malformed(format!("the header {name} must be a number of bytes")))

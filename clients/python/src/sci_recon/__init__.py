@@ -1,4 +1,4 @@
-"""Client of sci-recon.
+"""Python client of sci-recon.
 
 >>> from sci_recon import Client
 >>> result = Client("http://server.lab:8080").reconstruct(masks, measurement, algorithm="gap-tv")

@@ -11,28 +11,32 @@ from typing import Any
 from ._client import Client
 from ._watch import Watch, submitter
 
-# Keywords of `Client.reconstruct` that are no options here.
+# Keywords of `Client.reconstruct` that are not options of the command.
 OTHERS = {"self", "masks", "measurement", "folder", "key"}
 TYPES = {"float": float, "int": int}
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line; its options are the keywords of `Client.reconstruct`."""
+    """The parser of the command line. Its options include the keywords of `Client.reconstruct`."""
     program = argparse.ArgumentParser("python -m sci_recon", description=__doc__)
     watch = program.add_subparsers(dest="command", required=True).add_parser(
         "watch", help="turn each file that appears in a folder into a job"
     )
-    watch.add_argument("folder", help="the folder; each file's results come into NAME.result, with a REPORT.txt")
+    watch.add_argument(
+        "folder", help="folder to watch; the results of file NAME are saved in NAME.result, with a REPORT.txt"
+    )
     watch.add_argument("--masks", required=True, metavar="FILE", help="masks [frame, row, column]")
-    watch.add_argument("--url", help="address of the service; else SCI_RECON_URL")
-    watch.add_argument("--token", help="token of the lab; else SCI_RECON_TOKEN")
-    watch.add_argument("--file", action="append", metavar="NAME", help="files to fetch; may be repeated")
-    watch.add_argument("--settle-seconds", type=float, default=3.0, help="time without a change before a file is sent")
-    watch.add_argument("--once", action="store_true", help="end when all files are done")
+    watch.add_argument("--url", help="address of the service; by default SCI_RECON_URL")
+    watch.add_argument("--token", help="token of the lab; by default SCI_RECON_TOKEN")
+    watch.add_argument("--file", action="append", metavar="NAME", help="result file to download; may be repeated")
+    watch.add_argument(
+        "--settle-seconds", type=float, default=3.0, help="seconds without a change before a file is submitted"
+    )
+    watch.add_argument("--once", action="store_true", help="exit when all files are processed")
     for name, parameter in inspect.signature(Client.reconstruct).parameters.items():
         option = "--" + name.replace("_", "-")
         if name == "dark":
-            watch.add_argument(option, action="append", metavar="FILE", help="captures of the dark; may be repeated")
+            watch.add_argument(option, action="append", metavar="FILE", help="dark capture; may be repeated")
         elif name == "schedule":
             watch.add_argument(option, type=lambda path: json.loads(Path(path).read_text("utf-8")), metavar="FILE")
         elif name == "tile":
@@ -46,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def options(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Keywords of `Client.reconstruct` that were given."""
+    """The keywords of `Client.reconstruct` that the command line states."""
     names = set(inspect.signature(Client.reconstruct).parameters) - OTHERS
     given = {name: value for name, value in arguments.items() if name in names and value is not None}
     if tile := given.get("tile"):

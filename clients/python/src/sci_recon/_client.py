@@ -1,4 +1,4 @@
-"""The client: calibrations, measurements, jobs and their results."""
+"""The client: calibrations, measurements, jobs and results."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ BLOCK = 16
 class Client:
     """A connection to a service.
 
-    `url` and `token` are taken from SCI_RECON_URL and SCI_RECON_TOKEN where they are left out. With `progress` uploads,
-    jobs and downloads show a bar (needs tqdm).
+    The defaults of `url` and `token` are SCI_RECON_URL and SCI_RECON_TOKEN. With `progress`, uploads, jobs and downloads
+    show a progress bar (needs tqdm).
 
-    Methods raise `ApiError` for what the service refuses, and `SciReconError` when it can't be reached for
-    about five minutes.
+    Methods raise `ApiError` if the service rejects a request, and `SciReconError` if it is unreachable for about five
+    minutes.
     """
 
     def __init__(
@@ -51,7 +51,9 @@ class Client:
     ) -> None:
         url = url or os.environ.get("SCI_RECON_URL")
         if not url:
-            raise ValueError("no address of a service: Client('http://server.lab:8080'), or set SCI_RECON_URL")
+            raise ValueError(
+                "the address of the service is missing: use Client('http://server.lab:8080'), or set SCI_RECON_URL"
+            )
         token = token or os.environ.get("SCI_RECON_TOKEN")
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         timeout = httpx.Timeout(60, connect=10)
@@ -105,15 +107,14 @@ class Client:
         key: str | None = None,
         folder: str | os.PathLike[str] | None = None,
     ) -> Result:
-        """Uploads, submits, waits and downloads.
+        """Uploads the files, submits a job, waits for it, and downloads the frames.
 
-        `masks` are [B, H, W], `measurement` is [H, W] or [S, H, W]; arrays or file names. Their full scale, the stored
-        number that means 1, is by default the maximum of an integer type, and 1 for floats. Axes in another order are
-        stated where several fit: "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a
-        `mosaic`: "rggb", "bggr", "grbg" or "gbrg". The average of the `dark` captures is subtracted.
-        The other arguments are those of `calibrate`, `measure` and `submit`.
-        The frames come into `folder`, by default one that goes away with the result.
-        Errors that the checks found are issued as Python warnings, with their remedies.
+        `masks` are [B, H, W] and `measurement` is [H, W] or [S, H, W]; both may be arrays or file names. Full scale is the
+        stored number that means 1. Its default is the maximum of an integer type, and 1 for floats. If several orders of
+        the axes fit, state "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a `mosaic`:
+        "rggb", "bggr", "grbg" or "gbrg". The average of the `dark` captures is subtracted. The other arguments are those
+        of `calibrate`, `measure` and `submit`. The frames are saved in `folder`, by default a temporary folder that exists
+        as long as the result. Findings with severity "error" are issued as Python warnings, with their remedies.
         """
         if isinstance(masks, Calibration):
             calibration = masks
@@ -176,11 +177,11 @@ class Client:
         bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
-        """Makes a calibration of masks [B, H, W]; of a colour sensor with a `mosaic`.
+        """Creates a calibration from masks [B, H, W]. A colour sensor has a `mosaic`.
 
-        `array` is their name in a file of several arrays. `crop` selects a window with `row`, `column`, `height` and
-        `width`, and `frames` the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed" for
-        12-bit pixels in 3 bytes for 2. `bad_pixels` [H, W] is not 0 at bad pixels.
+        `array` is the name of the masks in a file of several arrays. `crop` selects a window with `row`, `column`, `height`
+        and `width`. `frames` selects the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed"
+        if two 12-bit pixels are stored in 3 bytes. `bad_pixels` [H, W] is nonzero at bad pixels.
         """
         given: Record = {
             "full_scale": full_scale,
@@ -209,9 +210,9 @@ class Client:
         bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
-        """Makes a calibration of raw captures, and waits until its masks are there.
+        """Creates a calibration from raw captures, and waits until its masks are computed.
 
-        `masks` has the captures of each aperture pattern in its order; each capture may be several repeats.
+        `masks` has a capture of each aperture pattern, in the order of the patterns. A capture may be a list of repeats.
         """
         captures: Record = {
             "masks": [self._uploads(repeats) for repeats in masks],
@@ -244,11 +245,10 @@ class Client:
         name: str | None = None,
         key: str | None = None,
     ) -> Measurement:
-        """Makes a measurement of snapshots [H, W] or [S, H, W] that were taken with a calibration.
+        """Creates a measurement from snapshots [H, W] or [S, H, W] that were taken with a calibration.
 
-        `crop` and `packing` are as for masks, and apply to `dark` too.
-        `sequence` is "contiguous" if the snapshots follow one another without a gap, else "separate"; by default the
-        camera's times decide.
+        `crop` and `packing` are as for masks, and apply to `dark`, too. `sequence` is "contiguous" if the snapshots follow
+        each other without a gap, otherwise "separate". By default it is derived from `camera_fps` and `exposure_s`.
         """
         record = self._create(
             "measurements",
@@ -283,10 +283,10 @@ class Client:
         label: str | None = None,
         key: str | None = None,
     ) -> Job:
-        """Asks for a reconstruction, and does not wait for it.
+        """Submits a job without waiting for it.
 
-        `snapshots` is "all", one by its index from 0, or (first, last) with both ends in. A second request with the same
-        `key` is answered with the first one's job.
+        `snapshots` is "all", an index from 0, or (first, last), both included. A repeated request with the same `key`
+        returns the job of the first one.
         """
         return Job(
             self,
@@ -306,20 +306,20 @@ class Client:
         )
 
     def calibration(self, identifier: str) -> Calibration:
-        """A calibration that was made before, by this client or another."""
+        """An existing calibration, created by this client or another."""
         return Calibration(self, self._get(f"/v1/calibrations/{identifier}"))
 
     def job(self, identifier: str) -> Job:
-        """A job that was submitted before, by this client or another."""
+        """An existing job, submitted by this client or another."""
         return Job(self, self._get(f"/v1/jobs/{identifier}"))
 
     def jobs(self, **filters: str) -> Iterator[Job]:
-        """All jobs, newest first; `filters` as in the contract, such as `state="running"`."""
+        """All jobs, newest first. `filters` are query parameters of the API, such as `state="running"`."""
         for record in self._pages("/v1/jobs", filters):
             yield Job(self, record)
 
     def upload(self, source: Source) -> str:
-        """Sends an array or a file, in pieces that survive cuts. Gives its SHA-256, by which requests name it."""
+        """Uploads an array or a file, and resumes after a lost connection. Returns its SHA-256, which identifies it in requests."""
         name = "array" if isinstance(source, np.ndarray) else os.path.basename(source)
         with transfer.as_file(source) as path, self._bar(f"upload {name}") as bar:
             return transfer.upload(self.http, path, bar)
@@ -329,18 +329,18 @@ class Client:
             return [self.upload(sources)]
         return [self.upload(source) for source in sources]
 
-    def _create(self, what: str, *, key: str | None = None, **body: Any) -> Record:
-        given = {name: value for name, value in body.items() if value is not None}
+    def _create(self, collection: str, *, key: str | None = None, **body: Any) -> Record:
+        stated = {name: value for name, value in body.items() if value is not None}
         headers = {"Idempotency-Key": key or str(uuid.uuid4())}
-        record: Record = transfer.send(self.http, "POST", f"/v1/{what}", json=given, headers=headers).json()
+        record: Record = transfer.send(self.http, "POST", f"/v1/{collection}", json=stated, headers=headers).json()
         return record
 
     def _get(self, path: str, **parameters: Any) -> Record:
         record: Record = transfer.send(self.http, "GET", path, params=parameters).json()
         return record
 
-    def _get_ended(self, path: str, wait: float) -> Record:
-        """A record, answered when its work has ended, or after `wait` seconds."""
+    def _get_waiting(self, path: str, wait: float) -> Record:
+        """Gets a record. The service answers once the work has ended, or after `wait` seconds."""
         record: Record = transfer.send(self.http, "GET", path, headers={"Prefer": f"wait={wait}"}).json()
         return record
 
@@ -359,7 +359,7 @@ class Client:
 
 @dataclass
 class Entity:
-    """Something that the service keeps. `record` is what it last said of it."""
+    """A resource of the service. `record` is its last known state."""
 
     client: Client = field(repr=False)
     record: Record = field(repr=False)
@@ -373,14 +373,14 @@ class Entity:
 
     @property
     def warnings(self) -> list[Record]:
-        """Findings of the checks: each has a `code`, a `severity`, a `detail` and a `remedy`."""
+        """Findings of the checks. Each has a `code`, a `severity`, a `detail` and a `remedy`."""
         return list(self.record.get("warnings", []))
 
     def _ready(self, collection: str) -> None:
         with self.client._bar(f"{self.__class__.__name__.lower()} {self.id}", "%") as bar:
             while self.record.get("state") == "preparing":
                 bar(int(self.record.get("percent", 0)), 100)
-                self.record = self.client._get_ended(f"/v1/{collection}/{self.id}", 2)
+                self.record = self.client._get_waiting(f"/v1/{collection}/{self.id}", 2)
         if problem := self.record.get("problem"):
             raise ApiError(problem["status"], problem)
         if self.record.get("state") == "failed":
@@ -389,15 +389,15 @@ class Entity:
 
 @dataclass
 class Calibration(Entity):
-    """Masks [B, H, W] of an optical setting."""
+    """Masks [B, H, W] of an optical setup."""
 
     def ready(self) -> Calibration:
-        """Waits until there are masks."""
+        """Waits until the masks are ready."""
         self._ready("calibrations")
         return self
 
     def masks(self) -> npt.NDArray[np.float32]:
-        """The masks [B, H, W] on [0, 1], from the uploaded file. `ValueError` unless that is an npy file."""
+        """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file."""
         record, name = self.record, self.record["masks"]
         with TemporaryDirectory(prefix="sci-recon-") as folder:
             path = Path(folder) / "masks.npy"
@@ -413,7 +413,7 @@ class Calibration(Entity):
         return masks
 
     def report(self) -> Record:
-        """What is known of the masks: a grade, findings, and what to do."""
+        """The report on the masks: a grade, and findings with remedies."""
         return self.client._get(f"/v1/calibrations/{self.id}/report")
 
 
@@ -422,7 +422,7 @@ class Measurement(Entity):
     """Snapshots [S, H, W] taken with a calibration."""
 
     def ready(self) -> Measurement:
-        """Waits until it is checked."""
+        """Waits until the measurement is checked."""
         self._ready("measurements")
         return self
 
@@ -433,14 +433,14 @@ class Job(Entity):
 
     @property
     def findings(self) -> list[Record]:
-        """Findings of the checks, and further reasons of the assessment."""
+        """Findings of the checks, and those of the assessment that are not among them."""
         reasons = (self.record.get("assessment") or {}).get("reasons", [])
         known = {finding["code"] for finding in self.warnings}
         return self.warnings + [reason for reason in reasons if reason["code"] not in known]
 
     @property
     def verdict(self) -> str:
-        """The grade of the frames, with the expected PSNR where it can be predicted."""
+        """The grade of the frames, and the expected PSNR if it can be predicted."""
         if assessment := self.record.get("assessment"):
             grade, psnr, low, high = (assessment[key] for key in ("grade", "psnr_db", "psnr_low_db", "psnr_high_db"))
             if psnr is None:
@@ -455,12 +455,15 @@ class Job(Entity):
         return str(self.record["state"])
 
     def refresh(self) -> Job:
-        """Asks for its state."""
+        """Reads the state of the job again."""
         self.record = self.client._get(f"/v1/jobs/{self.id}")
         return self
 
     def wait(self, timeout: float | None = None) -> Job:
-        """Waits until it has ended; `JobFailed` unless it has succeeded, `TimeoutError` after `timeout` seconds."""
+        """Waits until the job has ended.
+
+        Raises `JobFailed` if the job failed or was cancelled, and `TimeoutError` after `timeout` seconds.
+        """
         end = None if timeout is None else time.monotonic() + timeout
         with self.client._bar(f"job {self.id[:8]}", "%") as bar:
             while self.state not in ENDED:
@@ -468,10 +471,10 @@ class Job(Entity):
                 if end is not None and time.monotonic() >= end:
                     raise TimeoutError(f"job {self.id} is {self.state} after {timeout} s")
                 asked = time.monotonic()
-                # Answered when the job has ended; at once where too many of a lab wait.
+                # The service answers once the job has ended, but immediately if too many requests of the lab wait.
                 longest = 2.0 if self.client.progress else 20.0
                 wait = longest if end is None else max(0.0, min(longest, end - asked))
-                self.record = self.client._get_ended(f"/v1/jobs/{self.id}", round(wait, 3))
+                self.record = self.client._get_waiting(f"/v1/jobs/{self.id}", round(wait, 3))
                 if time.monotonic() - asked < 0.2:
                     transfer.pause(2)
             bar(100, 100)
@@ -480,26 +483,26 @@ class Job(Entity):
         return self
 
     def cancel(self) -> Job:
-        """Stops it within an iteration."""
+        """Cancels the job. Running tasks stop after their current iteration."""
         self.record = transfer.send(self.client.http, "POST", f"/v1/jobs/{self.id}/cancel").json()
         return self
 
     def retry(self) -> Job:
-        """Takes it up again after a failure or a cancel; tiles that are done stay so."""
+        """Continues a failed or cancelled job. Finished tiles are kept."""
         self.record = transfer.send(self.client.http, "POST", f"/v1/jobs/{self.id}/retry").json()
         return self
 
     def delete(self) -> None:
-        """Removes it and its results."""
+        """Deletes the job and its results."""
         transfer.send(self.client.http, "DELETE", f"/v1/jobs/{self.id}")
 
     def result(self, folder: str | os.PathLike[str] | None = None) -> Result:
-        """Its results, downloaded as they are asked for, into `folder` or one that goes away with them."""
+        """The results of the job. Files are downloaded on first use into `folder`, by default a temporary folder."""
         return Result(self, folder)
 
 
 class Result:
-    """The results of a job that has succeeded."""
+    """The results of a succeeded job."""
 
     def __init__(self, job: Job, folder: str | os.PathLike[str] | None = None) -> None:
         self.job = job
@@ -515,7 +518,7 @@ class Result:
         return f"<Result {name!r}: {self.job.verdict}; {frames} frames of {shape['height']}x{shape['width']}>"
 
     def _repr_html_(self) -> str:
-        """What Jupyter shows: name, verdict, and an animated preview if Pillow is installed."""
+        """HTML for Jupyter: name, verdict, and an animated preview if Pillow is installed."""
         text = f"<p>{html.escape(repr(self))}</p>"
         try:
             picture = preview(self.snapshot(self.snapshots[0]))
@@ -531,39 +534,40 @@ class Result:
 
     @cached_property
     def frames(self) -> npt.NDArray[np.float32]:
-        """All frames, those of one snapshot after the other: [B * S, H, W], of a colour sensor
-        [B * S, H, W, 3], float32.
+        """The frames of all snapshots in order: float32 [B * S, H, W], or [B * S, H, W, 3] for a colour sensor.
 
-        Of one snapshot it is a memory map of the downloaded file; of several an array in memory.
+        A single snapshot is a memory map of the downloaded file. Several snapshots are an array in memory.
         """
         parts = [self.snapshot(index) for index in self.snapshots]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def snapshot(self, index: int) -> npt.NDArray[np.float32]:
-        """The frames of one snapshot, [B, H, W], as a memory map of the downloaded file."""
+        """The frames [B, H, W] of a snapshot, as a memory map of the downloaded file."""
         frames: npt.NDArray[np.float32] = np.load(self.download("frames.npy", index), mmap_mode="r")
         return frames
 
     @property
     def assessment(self) -> Record | None:
-        """How good the frames are expected to be: `grade`, `psnr_db` between `psnr_low_db` and `psnr_high_db`, and `reasons`;
-        None where nothing can be predicted. The figures are None where a finding puts scale, dark or masks in doubt."""
+        """The predicted quality of the frames: `grade`, `psnr_db` between `psnr_low_db` and `psnr_high_db`, and `reasons`.
+
+        Returns None if no prediction is possible. The figures are None if a finding questions the scale, the dark frame or the masks.
+        """
         return self.job.record.get("assessment")
 
     def expected_error(self, index: int) -> npt.NDArray[np.float32]:
-        """The error expected in the frames of one snapshot, [B, H, W]: the root of the mean square of blocks of 16x16 pixels,
-        on the scale of the frames. `KeyError` where nothing can be told (`assessment` is None)."""
+        """The expected error of the frames of a snapshot, [B, H, W]: the root mean square error of each block of 16x16 pixels,
+        on the scale of the frames. Raises `KeyError` if no prediction is possible (`assessment` is None)."""
         blocks: npt.NDArray[np.float32] = np.load(self.download("error.npy", index))
         height, width = self.snapshot(index).shape[1:3]
         return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]
 
     def download(self, name: str, snapshot: int | None = None) -> Path:
-        """Fetches a file such as `stack.exr`, `frames.npy` or `frames/frame_0001.exr`, unless it is here already."""
+        """Downloads a file such as `stack.exr`, `frames.npy` or `frames/frame_0001.exr`, unless the folder has it."""
         index = self.snapshots[0] if snapshot is None else snapshot
         listed = self.job.client._get(f"/v1/jobs/{self.job.id}/snapshots/{index}")["files"]
         files = {file["name"]: file for file in listed if file["href"]}
         if name not in files:
-            raise KeyError(f"no file {name!r} of snapshot {index}; there are {', '.join(files)}")
+            raise KeyError(f"snapshot {index} has no file {name!r}; its files are {', '.join(files)}")
         file = files[name]
         path = self.folder / f"snapshot_{index:04d}" / name
         if not (path.is_file() and transfer.sha256(path) == file["sha256"]):
@@ -574,7 +578,7 @@ class Result:
         return path
 
     def movie(self, snapshot: int | None = None, format: str = "mp4") -> Path:
-        """Creates the movie of a snapshot, or of all in order, and fetches it.
+        """Creates and downloads the movie of a snapshot, or of all snapshots in order, at ten frames per second.
 
         `format` is "mp4" (AV1) or "gif", which presentation programs play.
         """
@@ -594,7 +598,7 @@ class Result:
 
     @property
     def manifest(self) -> Record:
-        """What went into the job and what came of it."""
+        """The manifest of the job: inputs, parameters and results."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
 
 
@@ -606,8 +610,8 @@ def describe(finding: Record) -> str:
 
 
 def preview(frames: npt.NDArray[np.float32], side: int = 256) -> bytes:
-    """An animated PNG of frames [B, H, W] or [B, H, W, 3], ten a second, from 0 to the white level. Its sides have at most
-    about `side` pixels."""
+    """An animated PNG of frames [B, H, W] or [B, H, W, 3]: ten frames per second, displayed from 0 to the white level. The
+    longer side is reduced to about `side` pixels."""
     from PIL import Image
 
     step = max(1, round(max(frames.shape[1:3]) / side))
@@ -619,15 +623,14 @@ def preview(frames: npt.NDArray[np.float32], side: int = 256) -> bytes:
 
 
 def white_level(frames: npt.NDArray[np.float32]) -> float:
-    """The 99.9th percentile of frames [B, H, W] or [B, H, W, 3]; 1 for black frames. It uses every n-th pixel of large
-    frames."""
+    """The 99.9th percentile of frames [B, H, W] or [B, H, W, 3], and 1 for black frames. Large frames are subsampled."""
     step = max(1, int((frames.size / 4e6) ** 0.5))
     level = float(np.percentile(frames[:, ::step, ::step], 99.9))
     return level if level > 0 else 1.0
 
 
 class Bar:
-    """A bar of tqdm from the first progress on, or nothing."""
+    """A progress bar of tqdm, which appears with the first progress. Does nothing unless `shown`."""
 
     def __init__(self, text: str, unit: str, shown: bool) -> None:
         self._make = None

@@ -1,4 +1,4 @@
-"""What can go wrong. All errors of this package are `SciReconError`."""
+"""Errors of this package. All of them are subclasses of `SciReconError`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from typing import Any
 
 
 class SciReconError(Exception):
-    """The service, a job of it, or the way to it has failed."""
+    """The service, a job, or the connection to the service failed."""
 
 
 class ApiError(SciReconError):
-    """The service has refused a request (RFC 9457).
+    """The service rejected a request.
 
-    `status` is that of HTTP, `code` never changes and is listed in the contract, `problem` is the whole answer.
+    `status` is the HTTP status, and `problem` the whole answer (RFC 9457). The API description lists the values of `code`,
+    which never change.
     """
 
     def __init__(self, status: int, problem: dict[str, Any]) -> None:
@@ -22,18 +23,18 @@ class ApiError(SciReconError):
         self.retryable = bool(problem.get("retryable"))
         detail = problem.get("detail") or problem.get("title") or ""
         errors = problem.get("errors", [])
-        # A detail that the errors repeat is said once.
+        # The message omits the detail if an error repeats it.
         summary = [] if any(detail in error["detail"] for error in errors) else [detail]
         parts = summary + [f"{error['pointer']}: {error['detail']}" for error in errors]
         super().__init__(f"{status} {self.code}".strip() + ": " + " ".join(part for part in parts if part))
 
 
 class CalibrationFailed(SciReconError):
-    """No masks could be made of the captures; the message has the reason."""
+    """The service could not compute masks from the captures. The message has the reason."""
 
 
 class JobFailed(SciReconError):
-    """The job has failed or was cancelled. `job` is its last state."""
+    """The job failed or was cancelled. `job` is its last record."""
 
     def __init__(self, job: dict[str, Any]) -> None:
         self.job = job

@@ -1,4 +1,4 @@
-"""A reader of napari: opens the frames of a job, or of a folder of results, as one layer."""
+"""A napari reader: opens the frames of a job, or of a folder of results, as a layer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ._client import Client, white_level
 
-# napari's layer: data, keywords of the layer, kind.
+# A layer of napari: data, keywords of the layer, and kind.
 Layer = tuple[Any, dict[str, Any], str]
 Reader = Callable[[str], list[Layer]]
 # The address of a job in the API, or of its page in the dashboard.
@@ -21,10 +21,10 @@ ADDRESS = re.compile(r"(?P<url>https?://.+?)/(?:v1|#)/jobs/(?P<job>[0-9a-f-]{36}
 
 
 def get_reader(path: str | list[str]) -> Reader | None:
-    """The reader of a path, or None where another plugin should open it.
+    """The reader for a path, or None if another plugin should open it.
 
-    A path is the address of a job (the token comes from SCI_RECON_TOKEN), or a folder with `frames.npy` and
-    `manifest.json`, such as those of the hot folder.
+    Supported paths are addresses of jobs, with the token in SCI_RECON_TOKEN, and folders with `frames.npy` and
+    `manifest.json`, such as the results in a watched folder.
     """
     if not isinstance(path, str):
         return None
@@ -42,7 +42,7 @@ def read_job(path: str) -> list[Layer]:
     if address is None:
         raise ValueError(f"{path} is not the address of a job")
     job = Client(address["url"]).job(address["job"])
-    # The frames stay mapped to a file, so the layer keeps the result.
+    # The frames are mapped from a temporary file. The layer keeps a reference to the result, so that the file stays.
     result = job.result()
     return [layer(result.frames, job.record.get("label") or job.id, {"verdict": job.verdict, "result": result})]
 

@@ -1,4 +1,4 @@
-"""Files to the service and back, over connections that break."""
+"""Uploads and downloads that continue after a lost connection."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ from ._errors import ApiError, SciReconError
 Source = str | os.PathLike[str] | npt.NDArray[Any]
 Progress = Callable[[int, int], None]
 
+# Bytes of a piece of an upload.
 PIECE = 4 << 20
-# About five minutes until the last try.
+# Attempts without progress; they take about five minutes.
 TRIES = 16
-# Statuses of a service that is starting, stopping or full, of a proxy before it, and of an upload whose piece
-# before the cut is still being written.
+# Statuses that are temporary: the service or a proxy is starting, stopping or overloaded, or the service still writes the
+# previous piece of the upload.
 PASSING = {408, 423, 429, 502, 503, 504}
 
 
 def pause(attempt: int, retry_after: str | None = None) -> None:
-    """Waits as long as the service says, or twice as long each time up to 30 s; not all clients at once."""
+    """Waits for the time in `Retry-After`, or for a random time that doubles with each attempt, up to 30 s."""
     if retry_after and retry_after.isdigit():
         time.sleep(min(int(retry_after), 60))
     else:
@@ -41,12 +42,12 @@ def pause(attempt: int, retry_after: str | None = None) -> None:
 
 
 def address(http: httpx.Client, path: str) -> str:
-    """A path of the service, which may be below another one of a proxy."""
+    """The address of a path of the service. A proxy may serve it below a prefix."""
     return str(http.base_url).rstrip("/") + path
 
 
 def refused(response: httpx.Response) -> ApiError:
-    """The error of an answer that has been read."""
+    """The error in an answer whose body has been read."""
     try:
         problem = response.json()
     except ValueError:
@@ -57,7 +58,7 @@ def refused(response: httpx.Response) -> ApiError:
 
 
 def send(http: httpx.Client, method: str, path: str, **options: Any) -> httpx.Response:
-    """One request, again after a cut or a passing refusal; it must do no harm when it arrives twice."""
+    """Sends a request, again after lost connections and temporary errors. The request must be safe to repeat."""
     for attempt in range(TRIES):
         last = attempt == TRIES - 1
         try:
@@ -69,18 +70,18 @@ def send(http: httpx.Client, method: str, path: str, **options: Any) -> httpx.Re
             continue
         if response.is_success or response.status_code == 304:
             return response
-        refusal = refused(response)
-        if last or response.status_code not in PASSING or refusal.problem.get("retryable") is False:
-            raise refusal
+        rejection = refused(response)
+        if last or response.status_code not in PASSING or rejection.problem.get("retryable") is False:
+            raise rejection
         pause(attempt, response.headers.get("Retry-After"))
     raise AssertionError("unreachable")
 
 
 @contextmanager
 def as_file(source: Source) -> Iterator[Path]:
-    """The file itself, or an array as an npy file that goes away afterwards."""
+    """The path of a file, or of a temporary npy file with an array."""
     if isinstance(source, np.ndarray):
-        # In a folder: Windows can't open a temporary file twice.
+        # A folder is used because Windows can't open a temporary file twice.
         with TemporaryDirectory(prefix="sci-recon-") as folder:
             path = Path(folder, "array.npy")
             np.save(path, np.ascontiguousarray(source))
@@ -88,12 +89,12 @@ def as_file(source: Source) -> Iterator[Path]:
     else:
         path = Path(source)
         if not path.is_file():
-            raise FileNotFoundError(f"{path} is no file")
+            raise FileNotFoundError(f"{path} does not exist or is not a file")
         yield path
 
 
 def upload(http: httpx.Client, path: Path, progress: Progress | None = None) -> str:
-    """Sends a file in pieces, going on where it was after each cut. Gives its SHA-256."""
+    """Sends a file in pieces, and resumes after a lost connection. Returns its SHA-256."""
     size = path.stat().st_size
     digest = sha256(path)
     try:
@@ -114,7 +115,7 @@ def upload(http: httpx.Client, path: Path, progress: Progress | None = None) -> 
             elif attempt:
                 before = uploader.offset
                 uploader.offset = uploader.get_offset()
-                # A piece that was cut counts as far as it came.
+                # Counts attempts again from 1 if the service kept a part of the last piece.
                 attempt = 1 if uploader.offset > before else attempt
             while uploader.offset < size:
                 uploader.upload_chunk()
@@ -123,9 +124,9 @@ def upload(http: httpx.Client, path: Path, progress: Progress | None = None) -> 
                     progress(uploader.offset, size)
         except (TusCommunicationError, TusUploadFailed, requests.RequestException) as error:
             status = getattr(error, "status_code", None)
-            if status in {404, 410}:  # What had come is gone: from the beginning.
+            if status in {404, 410}:  # The upload expired or is damaged: start again.
                 uploader, status = None, None
-            if status == 409:  # An answer was lost, not its piece: the service says where to go on.
+            if status == 409:  # The answer to a stored piece was lost: ask for the offset.
                 status = None
             attempt += 1
             if attempt == TRIES or status not in PASSING | {None}:
@@ -150,19 +151,19 @@ def sha256(path: Path) -> str:
 
 
 def download(http: httpx.Client, href: str, path: Path, expected: str, progress: Progress | None = None) -> None:
-    """Fetches a result, going on where it was after each cut, and checks its SHA-256."""
+    """Downloads a file, resumes after a lost connection, and checks its SHA-256."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A cut may have been in another process: the hash in its name tells whose beginning it is.
+    # The name includes the hash, so that another process can resume the download of the same content.
     part = path.with_name(f".{path.name}.{expected[:16]}.part")
     attempt = 0
     while True:
-        have = part.stat().st_size if part.exists() else 0
+        received = part.stat().st_size if part.exists() else 0
         headers = {"Accept-Encoding": "identity"}
-        if have:
-            headers |= {"Range": f"bytes={have}-", "If-Range": f'"{expected}"'}
+        if received:
+            headers |= {"Range": f"bytes={received}-", "If-Range": f'"{expected}"'}
         try:
             with http.stream("GET", href, headers=headers) as response:
-                if response.status_code == 416:  # All of it had come.
+                if response.status_code == 416:  # The file was complete already.
                     break
                 if not response.is_success:
                     response.read()
@@ -171,7 +172,7 @@ def download(http: httpx.Client, href: str, path: Path, expected: str, progress:
                         raise error
                     raise httpx.ReadError(str(error))
                 resumed = response.status_code == 206
-                total = int(response.headers["Content-Length"]) + (have if resumed else 0)
+                total = int(response.headers["Content-Length"]) + (received if resumed else 0)
                 with part.open("ab" if resumed else "wb") as file:
                     for block in response.iter_raw():
                         file.write(block)
@@ -184,8 +185,8 @@ def download(http: httpx.Client, href: str, path: Path, expected: str, progress:
             if attempt == TRIES:
                 raise SciReconError(f"GET {href}: {error}") from error
             pause(attempt)
-    found = sha256(part)
-    if found != expected:
+    actual = sha256(part)
+    if actual != expected:
         part.unlink()
-        raise SciReconError(f"{href}: the file's SHA-256 is {found}, not {expected}")
+        raise SciReconError(f"{href}: the downloaded file has the SHA-256 {actual}, not {expected}; download it again")
     part.replace(path)

@@ -1,7 +1,8 @@
-"""A hot folder on any system: each file that appears in a folder becomes a job.
+"""A watched folder on any operating system: each new file in the folder becomes a job.
 
-The folder is listed every second. `.sci-recon-watch.json` in it records what is done; a file is known by its name, size
-and time. Requests have keys that follow from these, so that a file makes one job however often the program is stopped.
+The folder is listed every second. Its file `.sci-recon-watch.json` records the processed files. A file is identified by its
+name, size and modification time. The idempotency keys of requests are derived from these, so that each file becomes a
+single job even if the program is restarted.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ ENDINGS = {".npy", ".tif", ".tiff", ".png", ".mat", ".h5", ".hdf5"}
 LEDGER = ".sci-recon-watch.json"
 ENDED = {"succeeded", "failed", "cancelled"}
 
-# Submits a file under a key.
+# Submits a file with an idempotency key.
 Submit = Callable[[Path, str], Job]
 
 
 class Watch:
-    """Watches `folder`: `submit` makes a job of a file, and its `files` come into NAME.result with a REPORT.txt.
+    """Watches `folder`. `submit` creates a job from file NAME. Its result `files` and a REPORT.txt are saved in NAME.result.
 
-    If that fails, NAME.failed.txt has the reason. Files in `own`, such as masks, are not submitted.
+    If the job fails, NAME.failed.txt has the reason. Files in `own`, such as masks, are not submitted.
     """
 
     def __init__(
@@ -51,34 +52,35 @@ class Watch:
         ledger = self.folder / LEDGER
         self.done: dict[str, str] = json.loads(ledger.read_text("utf-8")) if ledger.exists() else {}
         self.jobs: dict[str, tuple[Path, Job]] = {}
-        self.seen: dict[str, float] = {}
+        # Files that may still change, with the time at which they were first listed.
+        self.settling: dict[str, float] = {}
 
     def run(self, once: bool = False) -> None:
-        """Watches until it is interrupted, or with `once` until all files are done."""
+        """Watches until it is interrupted. With `once` it returns when all files are processed."""
         while True:
             self.look()
-            if once and not self.jobs and not self.seen:
+            if once and not self.jobs and not self.settling:
                 return
             time.sleep(min(1.0, max(self.settle_seconds, 0.05)))
 
     def look(self) -> None:
-        """Submits files that have stopped changing, and fetches results of jobs that have ended."""
-        now, seen = time.monotonic(), {}
+        """Submits files that no longer change, and downloads the results of finished jobs."""
+        now, settling = time.monotonic(), {}
         for path in sorted(self.folder.iterdir(), key=lambda path: path.name):
             key = self._key(path)
             if key is None or key in self.done or key in self.jobs or path.resolve() in self.own:
                 continue
-            since = self.seen.get(key, now)
+            since = self.settling.get(key, now)
             if now - since < self.settle_seconds:
-                seen[key] = since
+                settling[key] = since
                 continue
-            self._step(key, path, partial(self._begin, key, path))
-        self.seen = seen
+            self._step(key, path, partial(self._submit, key, path))
+        self.settling = settling
         for key, (path, job) in list(self.jobs.items()):
             self._step(key, path, partial(self._advance, key, path, job))
 
     def _step(self, key: str, path: Path, step: Callable[[], None]) -> None:
-        """Does a step for a file. A service that is full or unreachable is asked again at the next look."""
+        """Runs a step for a file. If the service is busy or unreachable, the step is repeated at the next look."""
         try:
             step()
         except ApiError as error:
@@ -89,13 +91,13 @@ class Watch:
         except SciReconError as error:
             print(f"waiting: {error}", flush=True)
 
-    def _begin(self, key: str, path: Path) -> None:
+    def _submit(self, key: str, path: Path) -> None:
         job = self.submit(path, key)
         self.jobs[key] = (path, job)
         print(f"{path.name} is job {job.id}", flush=True)
 
     def _key(self, path: Path) -> str | None:
-        """Identifies a file as it is now; None for other things than files with snapshots."""
+        """The key of a file and its present content. Paths that are not files of snapshots have no key."""
         if path.name.startswith(".") or path.suffix.lower() not in ENDINGS or path.is_symlink() or not path.is_file():
             return None
         try:
@@ -111,7 +113,7 @@ class Watch:
         if job.state != "succeeded":
             self._fail(key, path, JobFailed(job.record))
             return
-        # The folder gets its name when it is complete.
+        # The folder is renamed once it is complete.
         draft = path.with_name(f".{path.name}.{job.id}.part")
         result = Result(job, draft)
         for snapshot in result.snapshots:
@@ -120,44 +122,44 @@ class Watch:
         lines = [f"{path.name}: {job.verdict}", "", *map(describe, job.findings), "", f"job {job.id}"]
         draft.mkdir(exist_ok=True)
         (draft / "REPORT.txt").write_text("\n".join(lines) + "\n", "utf-8")
-        folder = draft.rename(self._free(path, ".result"))
+        folder = draft.rename(self._unused(path, ".result"))
         print(f"{path.name} is in {folder.name}: {job.verdict}", flush=True)
         for finding in job.findings:
             print(f"    {describe(finding)}", flush=True)
-        self._note(key, folder.name)
+        self._record(key, folder.name)
 
     def _fail(self, key: str, path: Path, error: Exception) -> None:
-        place = self._free(path, ".failed.txt")
-        place.write_text(f"{path.name}: {error}\n\nTo try again, save the file again.\n", "utf-8")
+        report = self._unused(path, ".failed.txt")
+        report.write_text(f"{path.name}: {error}\n\nTo try again, save the file again.\n", "utf-8")
         print(f"{path.name} has failed: {error}", flush=True)
-        self._note(key, place.name)
+        self._record(key, report.name)
 
-    def _free(self, path: Path, ending: str) -> Path:
-        """A path beside a file that nothing has yet."""
+    def _unused(self, path: Path, ending: str) -> Path:
+        """An unused path in the folder of a file, with its name and this ending."""
         names = (f"{path.name}{number}{ending}" for number in ["", *(f".{k}" for k in range(2, 10_000))])
-        return next(place for place in map(path.with_name, names) if not place.exists())
+        return next(unused for unused in map(path.with_name, names) if not unused.exists())
 
-    def _note(self, key: str, place: str) -> None:
+    def _record(self, key: str, output: str) -> None:
         self.jobs.pop(key, None)
-        self.done[key] = place
+        self.done[key] = output
         draft = self.folder / f"{LEDGER}.part"
         draft.write_text(json.dumps(self.done, indent=1), "utf-8")
         draft.replace(self.folder / LEDGER)
 
 
 def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
-    """Makes the calibration, and returns how files are submitted; `options` are keywords of `Client.reconstruct`."""
+    """Creates the calibration, and returns a function that submits files. `options` are keywords of `Client.reconstruct`."""
     shared = ("full_scale", "array", "axes", "crop", "frames", "packing", "name")
-    of_masks = {f"masks_{keyword}": keyword for keyword in shared}
+    mask_options = {f"masks_{keyword}": keyword for keyword in shared}
     calibration = client.calibrate(
         masks,
         mosaic=options.pop("mosaic", None),
         bad_pixels=options.pop("bad_pixels", None),
-        **{keyword: options.pop(option, None) for option, keyword in of_masks.items()},
+        **{keyword: options.pop(option, None) for option, keyword in mask_options.items()},
     )
-    of_job = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "label"}
-    job = {name: value for name, value in options.items() if name in of_job}
-    measurement = {name: value for name, value in options.items() if name not in of_job}
+    job_options = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "label"}
+    job = {name: value for name, value in options.items() if name in job_options}
+    measurement = {name: value for name, value in options.items() if name not in job_options}
 
     def submit(path: Path, key: str) -> Job:
         taken = client.measure(calibration, path, key=key, **measurement)

@@ -24,6 +24,25 @@ pub struct DisplayWindow {
     pub white: f32,
 }
 
+/// The values of black and white do not span a range.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("black is {black} and white is {white}; black must be below white")]
+pub struct EmptyWindow {
+    black: f32,
+    white: f32,
+}
+
+impl DisplayWindow {
+    /// Errors: [`EmptyWindow`] if black is not below white, or if a value or their difference is not finite.
+    pub fn new(black: f32, white: f32) -> Result<Self, EmptyWindow> {
+        // A finite positive difference implies finite values.
+        if black < white && (white - black).is_finite() {
+            return Ok(Self { black, white });
+        }
+        Err(EmptyWindow { black, white })
+    }
+}
+
 /// The input of a movie.
 #[derive(Debug)]
 pub struct MovieTask {
@@ -207,6 +226,22 @@ mod tests {
         monitor.stop();
         let stopped = write(&path, &task(sha256), &monitor);
         assert!(matches!(stopped, Err(PipelineError::Stopped)), "{stopped:?}");
+    }
+
+    #[test]
+    fn black_must_be_finite_and_below_white() {
+        let window = DisplayWindow::new(-0.5, 2.0).unwrap();
+        assert_eq!(window, DisplayWindow { black: -0.5, white: 2.0 });
+        for (black, white) in [
+            (1.0, 1.0),
+            (1.0, 0.0),
+            (f32::NAN, 1.0),
+            (0.0, f32::INFINITY),
+            (f32::NEG_INFINITY, 0.0),
+            (f32::MIN, f32::MAX),
+        ] {
+            assert!(DisplayWindow::new(black, white).is_err(), "{black} {white}");
+        }
     }
 
     #[test]
