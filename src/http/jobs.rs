@@ -338,9 +338,7 @@ fn check_networks(app: &App, spec: &JobSpec) -> Result<()> {
     }
     app.networks().map_err(|missing| {
         let name = spec.algorithm.into_str();
-        let detail = format!(
-            "{name} runs a network, and this service has {missing}; gap-tv3d needs no network"
-        );
+        let detail = format!("{name} runs a network, but {missing}; gap-tv3d needs no network");
         ApiError::field("/algorithm", detail)
     })
 }
