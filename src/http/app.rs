@@ -14,7 +14,8 @@ use super::events::Events;
 use super::metrics::Metrics;
 use super::rendering::Pictures;
 use super::revocation::Revocations;
-use super::shares::Turns;
+use super::shares::{Changes, Turns};
+use crate::audit::AuditLog;
 use crate::config::ServeArguments;
 use engine::job::{Timestamp, without_paths};
 use formats::Limits;
@@ -39,8 +40,7 @@ pub struct Services {
     pub(super) admission: Admission,
     /// Each read takes a core and a frame of memory; a lab has one at a time.
     pub(super) intake: Turns,
-    /// Held by requests that change something, from the check of their condition to the change.
-    pub(super) changes: Mutex<()>,
+    pub(super) changes: Changes,
     /// Ends what has no end of its own.
     pub(super) closing: CancellationToken,
     /// When it was last tried whether files can be written, and what came of it.
@@ -77,7 +77,7 @@ impl App {
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
             intake: Turns::new(READS_AT_ONCE, READS),
-            changes: Mutex::default(),
+            changes: Changes::default(),
             closing,
             disk_tried: Mutex::default(),
             metrics,
