@@ -158,6 +158,9 @@ pub(super) async fn guard(
             if let Some(rate) = rate {
                 rate.state(response.headers_mut());
             }
+            // A browser must not show data after the end of a session.
+            let cached = response.headers_mut().entry(header::CACHE_CONTROL);
+            cached.or_insert(HeaderValue::from_static("private, no-cache"));
             if response.body().size_hint().exact().is_some() {
                 return response;
             }
