@@ -17,6 +17,8 @@ use tower_http::cors::{AllowHeaders, CorsLayer};
 
 use super::access::{self, Rule};
 use super::app::App;
+use super::client_places::{self, Places};
+use super::listen::connection_limit;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
     algorithms, blobs, calibrations, contract, dashboard, events, exports, jobs, labs, layers, me,
@@ -118,6 +120,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(layers::method_not_allowed)
         .layer(DefaultBodyLimit::max(JSON_BYTES))
         .layer(CatchPanicLayer::custom(layers::panicked))
+        .layer(from_fn_with_state(Places::new(connection_limit()), client_places::limit))
         .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::relative_references))
         .layer(from_fn(layers::observe))
