@@ -195,6 +195,19 @@ pub struct ServeArguments {
     /// Format of log lines.
     #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
+
+    /// The file of the audit log.
+    #[command(flatten)]
+    pub audit: AuditArguments,
+}
+
+/// The file of the audit log.
+#[derive(Debug, Clone, Default, Args)]
+pub struct AuditArguments {
+    /// File to which a line of JSON is appended for each change and each failed sign-in. It is opened for each line, so that
+    /// it can be rotated [default: none; commands use the file of the running service].
+    #[arg(long, env = "SCI_RECON_AUDIT_LOG", value_name = "FILE")]
+    pub audit_log: Option<PathBuf>,
 }
 
 /// Address of a NATS server, and a credential for it.

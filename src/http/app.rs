@@ -35,6 +35,7 @@ pub struct App(Arc<Services>);
 pub struct Services {
     pub(super) store: Store,
     pub(super) settings: ServeArguments,
+    pub(super) audit: AuditLog,
     pub(super) started_at: Timestamp,
     pub(super) limits: Limits,
     pub(super) admission: Admission,
@@ -61,7 +62,7 @@ impl App {
     /// have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
-        settings: &ServeArguments,
+        (settings, audit): (&ServeArguments, AuditLog),
         metrics: Metrics,
         (cluster, confinement): (
             Option<watch::Receiver<Option<String>>>,
@@ -84,6 +85,7 @@ impl App {
             cluster,
             confinement,
             settings: settings.clone(),
+            audit,
             store,
         }))
     }
