@@ -12,17 +12,20 @@ use super::context::Wait;
 use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
+use super::rate::Rates;
 use super::rendering::Pictures;
 use super::revocation::Revocations;
 use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
 use crate::config::ServeArguments;
-use engine::job::{Timestamp, without_paths};
+use engine::job::{Timestamp, TokenId, without_paths};
 use formats::Limits;
 use store::Store;
 
 /// Labs for which a file is read at the same time, so that a slow one keeps no other lab waiting.
 const READS_AT_ONCE: usize = 4;
+/// Sessions that a token may begin in a minute. Each one writes to the database.
+const SESSIONS_PER_MINUTE: u32 = 20;
 /// Requests of a lab that may wait for a file to be read.
 const READS: usize = 32;
 
@@ -49,6 +52,8 @@ pub struct Services {
     pub(super) metrics: Metrics,
     pub(super) events: Events,
     pub(super) revocations: Revocations,
+    /// The rate at which each token begins sessions.
+    pub(super) session_rates: Rates<TokenId>,
     pub(super) pictures: Pictures,
     /// Why no tile can leave this machine, where tiles should.
     pub(super) cluster: Option<watch::Receiver<Option<String>>>,
@@ -73,6 +78,7 @@ impl App {
         Self(Arc::new(Services {
             events: Events::start(store.clone(), closing.clone()),
             revocations: Revocations::start(store.clone()),
+            session_rates: Rates::new(SESSIONS_PER_MINUTE),
             pictures: Pictures::new(),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
