@@ -1,12 +1,13 @@
 //! All settings of the service. The comments are the help of the command line.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::{Args, ValueEnum};
 use hyper::http::{HeaderValue, Uri};
+use ipnet::IpNet;
 use strum::IntoStaticStr;
 
 #[cfg(feature = "nats")]
@@ -53,6 +54,11 @@ pub struct ServeArguments {
     #[arg(long = "cors-origin", env = "SCI_RECON_CORS_ORIGINS", value_name = "ORIGIN", value_delimiter = ',',
           value_parser = origin)]
     pub cors_origins: Vec<HeaderValue>,
+
+    /// Addresses or networks of proxies, such as `127.0.0.1,10.1.0.0/16`, which may state the address of a client in
+    /// `X-Forwarded-For` or `Forwarded`. They must set that header, not pass on the one of the client.
+    #[arg(long, env = "SCI_RECON_TRUSTED_PROXIES", value_name = "NETWORK", value_delimiter = ',', value_parser = network)]
+    pub trusted_proxies: Vec<IpNet>,
 
     /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
     /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
@@ -189,6 +195,19 @@ pub struct ServeArguments {
     /// Format of log lines.
     #[arg(long, env = "SCI_RECON_LOG_FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
+
+    /// The file of the audit log.
+    #[command(flatten)]
+    pub audit: AuditArguments,
+}
+
+/// The file of the audit log.
+#[derive(Debug, Clone, Default, Args)]
+pub struct AuditArguments {
+    /// File to which a line of JSON is appended for each change and each failed sign-in. It is opened for each line, so that
+    /// it can be rotated [default: none; commands use the file of the running service].
+    #[arg(long, env = "SCI_RECON_AUDIT_LOG", value_name = "FILE")]
+    pub audit_log: Option<PathBuf>,
 }
 
 /// Address of a NATS server, and a credential for it.
@@ -379,6 +398,14 @@ fn seconds(text: &str) -> Result<f64, String> {
 fn fraction(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
     share.ok_or_else(|| format!("{text:?} is not a share from 0 to 1"))
+}
+
+/// A network, such as 10.1.0.0/16, or a single address.
+fn network(text: &str) -> Result<IpNet, String> {
+    let address = || text.parse::<IpAddr>().map(IpNet::from);
+    text.parse::<IpNet>()
+        .or_else(|_| address())
+        .map_err(|_| format!("{text:?} is neither an address nor a network such as 10.1.0.0/16"))
 }
 
 /// The origin of a page: scheme, host and port.

@@ -4,8 +4,11 @@ use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 
+use super::audited::{Change, audit_log, audited};
 use super::wait::print_of_store;
+use crate::audit::AuditLog;
 use crate::cli::error::Result;
+use crate::config::AuditArguments;
 use engine::job::{JobId, JobState, Lab, Label, priority_error};
 use store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
 
@@ -17,6 +20,8 @@ pub struct Arguments {
     /// Folder of the service's data.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     data: PathBuf,
+    #[command(flatten)]
+    audit: AuditArguments,
     #[command(subcommand)]
     action: Action,
 }
@@ -66,39 +71,45 @@ fn priority(text: &str) -> Result<i32, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    print_of_store(&arguments.data, async |store| act(store, &arguments.action).await)
+    let log = audit_log(&arguments.audit, &arguments.data)?;
+    print_of_store(&arguments.data, async |store| act(store, &log, &arguments.action).await)
 }
 
-async fn act(store: &Store, action: &Action) -> Result<String> {
-    let lab_of = async |id| Ok::<_, StoreError>(store.job_of_any_lab(id).await?.lab);
-    let id = match *action {
+async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
+    let (id, name) = match *action {
         Action::List { ref lab, ref state, limit } => {
             let states = (!state.is_empty()).then(|| state.clone());
             let filter = JobFilter { states, ..JobFilter::default() };
             let jobs = store.jobs(lab.as_ref(), &filter, limit).await?.items;
             return Ok(table(&jobs, &store.progress_of(&jobs).await?));
         }
-        Action::Delete { job } => {
-            let lab = lab_of(job).await?;
-            store.delete_job(&lab, job).await?;
-            return Ok(format!("deleted {job} of {lab}"));
-        }
-        Action::Cancel { job } => {
-            store.cancel_job(&lab_of(job).await?, job).await?;
-            job
-        }
-        Action::Retry { job } => {
-            store.retry_job(&lab_of(job).await?, job).await?;
-            job
-        }
-        Action::Priority { job, priority } => {
-            let changes = JobChanges { priority: Some(priority), ..JobChanges::default() };
-            store.change_job(&lab_of(job).await?, job, &changes).await?;
-            job
-        }
+        Action::Delete { job } => (job, "job delete"),
+        Action::Cancel { job } => (job, "job cancel"),
+        Action::Retry { job } => (job, "job retry"),
+        Action::Priority { job, .. } => (job, "job priority"),
     };
+    let lab = store.job_of_any_lab(id).await?.lab;
+    let change = Change { action: name, lab: Some(lab.clone()), object: id.to_string() };
+    audited(log, change, async { Ok(alter(store, &lab, action).await?) }).await?;
+    if matches!(action, Action::Delete { .. }) {
+        return Ok(format!("deleted {id} of {lab}"));
+    }
     let jobs = [store.job_of_any_lab(id).await?];
     Ok(table(&jobs, &store.progress_of(&jobs).await?))
+}
+
+/// Changes a job of this lab.
+async fn alter(store: &Store, lab: &Lab, action: &Action) -> Result<(), StoreError> {
+    match *action {
+        Action::List { .. } => Ok(()),
+        Action::Delete { job } => store.delete_job(lab, job).await,
+        Action::Cancel { job } => store.cancel_job(lab, job).await.map(drop),
+        Action::Retry { job } => store.retry_job(lab, job).await.map(drop),
+        Action::Priority { job, priority } => {
+            let changes = JobChanges { priority: Some(priority), ..JobChanges::default() };
+            store.change_job(lab, job, &changes).await.map(drop)
+        }
+    }
 }
 
 fn table(jobs: &[Job], progress: &[JobProgress]) -> String {

@@ -5,8 +5,11 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use super::audited::{Change, audit_log, audited};
 use super::wait::print_of_store;
+use crate::audit::AuditLog;
 use crate::cli::error::Result;
+use crate::config::AuditArguments;
 use engine::job::{Lab, Sha256};
 use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 
@@ -19,6 +22,8 @@ pub struct Arguments {
     /// Folder of the service's data.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     data: PathBuf,
+    #[command(flatten)]
+    audit: AuditArguments,
     #[command(subcommand)]
     action: Action,
 }
@@ -81,19 +86,24 @@ fn share(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    print_of_store(&arguments.data, async |store| act(store, &arguments.action).await)
+    let log = audit_log(&arguments.audit, &arguments.data)?;
+    print_of_store(&arguments.data, async |store| act(store, &log, &arguments.action).await)
 }
 
-async fn act(store: &Store, action: &Action) -> Result<String> {
+async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
+    let change =
+        |action, lab: &Lab, object: String| Change { action, lab: Some(lab.clone()), object };
     match action {
         Action::List => {}
         Action::Uploads { lab } => return uploads(store, lab).await,
         Action::DeleteUpload { lab, sha256 } => {
-            store.delete_upload(lab, *sha256).await?;
+            let change = change("lab delete-upload", lab, sha256.to_string());
+            audited(log, change, async { Ok(store.delete_upload(lab, *sha256).await?) }).await?;
             return Ok(format!("deleted {sha256} of {lab}"));
         }
         Action::Remove { lab } => {
-            store.remove_lab(lab).await?;
+            let change = change("lab remove", lab, lab.to_string());
+            audited(log, change, async { Ok(store.remove_lab(lab).await?) }).await?;
             return Ok(format!("removed {lab}"));
         }
         Action::Set { lab, new, share, bytes, jobs } => {
@@ -106,7 +116,8 @@ async fn act(store: &Store, action: &Action) -> Result<String> {
                 max_bytes: bytes.map(|limit| limit.0),
                 max_jobs: jobs.map(|limit| limit.0),
             };
-            store.entitle(lab, entitlement).await?;
+            let change = change("lab set", lab, lab.to_string());
+            audited(log, change, async { Ok(store.entitle(lab, entitlement).await?) }).await?;
         }
     }
     let (mut rows, costs) = (Vec::new(), store.cost_left_by_lab().await?);

@@ -17,7 +17,8 @@ pub(crate) fn start(format: LogFormat) {
         .with_ansi(std::io::stderr().is_terminal());
     let started = match format {
         LogFormat::Text => lines.try_init(),
-        LogFormat::Json => lines.json().try_init(),
+        // Spans are not nested, so the list of all spans would repeat the current one.
+        LogFormat::Json => lines.json().with_span_list(false).try_init(),
     };
     if let Err(error) = started {
         tracing::debug!(%error, "logging has already started");

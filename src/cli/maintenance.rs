@@ -2,9 +2,10 @@
 
 use std::time::{Duration, Instant};
 
+use crate::audit::{Actor, AuditLog, Entry, Outcome};
 use crate::config::ServeArguments;
 use engine::job::Timestamp;
-use store::{Store, StoreError};
+use store::{Expired, Store, StoreError};
 
 /// Time between two foldings of metrics.
 const TICK: Duration = Duration::from_secs(5);
@@ -15,7 +16,12 @@ const MIN_AGE: Duration = Duration::from_secs(3600);
 const DAY: Duration = Duration::from_secs(86_400);
 
 /// Folds metrics every few seconds, and cleans up at the start and every ten minutes.
-pub(super) async fn maintain(store: Store, fold_metrics: impl Fn(), settings: ServeArguments) {
+pub(super) async fn maintain(
+    store: Store,
+    fold_metrics: impl Fn(),
+    settings: ServeArguments,
+    audit: AuditLog,
+) {
     let mut tick = tokio::time::interval(TICK);
     let mut noted = Instant::now();
     for count in 0u64.. {
@@ -31,13 +37,39 @@ pub(super) async fn maintain(store: Store, fold_metrics: impl Fn(), settings: Se
         if let Err(error) = store.look_at_database().await {
             tracing::error!(%error, "the database can't be checked");
         }
-        if let Err(error) = clean(&store, &settings).await {
+        if let Err(error) = clean(&store, &settings, &audit).await {
             tracing::error!(%error, "cleaning up has failed");
         }
     }
 }
 
-async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreError> {
+/// Records deletions of one kind, and counts them.
+struct Deletions<'a> {
+    audit: &'a AuditLog,
+    action: &'static str,
+    count: usize,
+}
+
+impl<'a> Deletions<'a> {
+    fn new(audit: &'a AuditLog, action: &'static str) -> Self {
+        Self { audit, action, count: 0 }
+    }
+
+    fn record<Id: ToString>(&mut self, expired: Expired<Id>) {
+        self.count += 1;
+        self.audit.record(&Entry {
+            lab: Some(expired.lab),
+            object: Some(expired.id.to_string()),
+            ..Entry::new(Actor::Service, self.action, Outcome::Done)
+        });
+    }
+}
+
+async fn clean(
+    store: &Store,
+    settings: &ServeArguments,
+    audit: &AuditLog,
+) -> Result<(), StoreError> {
     // 1. Remove the remains of crashes.
     store.advance_generation().await?;
     store.dir().sweep_tmp()?;
@@ -53,25 +85,29 @@ async fn clean(store: &Store, settings: &ServeArguments) -> Result<(), StoreErro
         tracing::info!("files from before the last update are no longer kept");
     }
     // 2. Remove expired uploads and jobs.
+    let mut uploads = Deletions::new(audit, "delete unused upload");
+    let mut unfinished = Deletions::new(audit, "delete unfinished upload");
+    let mut jobs = Deletions::new(audit, "delete ended job");
+    store.expire_partials(settings.upload_age(), |upload| unfinished.record(upload)).await?;
     let old = store.ago(settings.upload_age()).await?;
-    let uploads = store.expire_partials(settings.upload_age()).await? + store.collect(old).await?;
-    let mut jobs = match settings.job_days {
-        Some(days) => store.remove_jobs(store.ago(DAY * days).await?, u64::MAX).await?,
-        None => 0,
-    };
+    store.collect(old).await?.into_iter().for_each(|upload| uploads.record(upload));
+    if let Some(days) = settings.job_days {
+        let old = store.ago(DAY * days).await?;
+        store.remove_jobs(old, u64::MAX, |job| jobs.record(job)).await?;
+    }
     // 3. If the disk is nearly full, remove unused files, then the oldest jobs.
-    let mut unused = 0;
     if store.dir().disk()?.0 < settings.low_water_bytes {
         let old = store.ago(MIN_AGE).await?;
-        unused = store.collect(old).await?;
-        jobs += store.remove_jobs(old, settings.low_water_bytes).await?;
+        store.collect(old).await?.into_iter().for_each(|upload| uploads.record(upload));
+        store.remove_jobs(old, settings.low_water_bytes, |job| jobs.record(job)).await?;
     }
+    let (uploads, unfinished, jobs) = (uploads.count, unfinished.count, jobs.count);
     // 4. Keep a reserve, so that the service can start on a full disk.
     if let Err(error) = store.dir().keep_reserve(settings.min_free_bytes) {
         tracing::warn!(%error, "there is no reserve for a start on a full disk");
     }
-    if orphans + uploads + jobs + unused > 0 {
-        tracing::info!(orphans, uploads, jobs, unused, "cleaned up");
+    if orphans + uploads + unfinished + jobs > 0 {
+        tracing::info!(orphans, uploads, unfinished, jobs, "cleaned up");
     }
     Ok(())
 }

@@ -4,6 +4,7 @@
 #![deny(clippy::print_stdout)]
 
 mod arguments;
+mod audited;
 mod client;
 mod command_line;
 mod confine;

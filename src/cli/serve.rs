@@ -14,6 +14,7 @@ use super::confine::confinement;
 use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
+use crate::audit::AuditLog;
 #[cfg(feature = "nats")]
 use crate::config::{ClusterArguments, RemoteArguments, VERSION};
 use crate::config::{ConfigError, EngineArguments, ServeArguments, Takes, WorkerArguments};
@@ -41,6 +42,8 @@ pub enum ServeError {
     Listen { address: SocketAddr, source: std::io::Error },
     #[error("can't {action}: {source}")]
     Io { action: &'static str, source: std::io::Error },
+    #[error("can't write the audit log {file}: {source}; correct --audit-log, or its permissions")]
+    Audit { file: String, source: std::io::Error },
     #[cfg(feature = "nats")]
     #[error(transparent)]
     Cluster(#[from] ClusterError),
@@ -59,7 +62,12 @@ pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
 }
 
 async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
-    // 1. Open the store exclusively.
+    // 1. Open the audit log, and the store exclusively.
+    let file = settings.audit.audit_log.as_deref();
+    let audit = AuditLog::open(file).map_err(|source| {
+        let file = file.map_or(String::new(), |file| file.display().to_string());
+        ServeError::Audit { file, source }
+    })?;
     let accept_database = settings.accept_database;
     let store = Store::open(&settings.data, Purpose::Serve { accept_database }).await?;
     settings.check(store.is_open().await?)?;
@@ -87,7 +95,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         tracing::warn!("{reason}");
     }
     tracing::info!(%address, data = %store.dir().root().display(), swept, "listening");
-    announce(store.dir().root(), address)?;
+    announce(store.dir().root(), address, settings)?;
     // 4. Run workers and maintenance until the signal.
     let (stopper, stop) = watch::channel(false);
     let metrics = Metrics::install()?;
@@ -108,7 +116,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let supervisor = Supervisor::start(&store, &program, lines, &stop);
     let closing = CancellationToken::new();
     let folded = metrics.clone();
-    let maintenance = maintain(store.clone(), move || folded.upkeep(), settings.clone());
+    let maintenance =
+        maintain(store.clone(), move || folded.upkeep(), settings.clone(), audit.clone());
     tokio::spawn(closing.clone().run_until_cancelled_owned(maintenance));
     if settings.scrub_bytes > 0 {
         let (store, rate) = (store.clone(), settings.scrub_bytes);
@@ -123,7 +132,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. Serve the API.
-    let app = App::new(store.clone(), settings, metrics, (trouble, confinement), closing);
+    let app = App::new(store.clone(), (settings, audit), metrics, (trouble, confinement), closing);
     let service = router(app);
     tokio::select! {
         () = listen(listener, service, settings, stopped(stop.clone())) => {}
@@ -141,14 +150,19 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     Ok(())
 }
 
-/// Announces the address of the service as one JSON line on standard output and in a file.
-fn announce(root: &Path, address: SocketAddr) -> Result<(), ServeError> {
-    let text = serde_json::json!({
+/// Announces the address of the service, and the file of its audit log, as one JSON line on standard output and in a
+/// file.
+fn announce(root: &Path, address: SocketAddr, settings: &ServeArguments) -> Result<(), ServeError> {
+    let mut facts = serde_json::json!({
         "address": address.to_string(),
         "url": format!("http://{address}"),
         "pid": std::process::id(),
-    })
-    .to_string();
+    });
+    if let Some(file) = &settings.audit.audit_log {
+        let file = std::path::absolute(file).map_err(io("find the audit log"))?;
+        facts["audit_log"] = file.to_string_lossy().into();
+    }
+    let text = facts.to_string();
     let (path, draft) = (root.join(ADDRESS_FILE), root.join("server.json.new"));
     std::fs::write(&draft, &text).map_err(io("write server.json"))?;
     std::fs::rename(draft, path).map_err(io("write server.json"))?;

@@ -6,9 +6,12 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 
 use super::CliError;
+use super::audited::{Change, audit_log, audited};
 use super::output::print_line;
 use super::wait::wait;
+use crate::audit::AuditLog;
 use crate::cli::error::Result;
+use crate::config::AuditArguments;
 use engine::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use store::{Purpose, Store, StoreError, Token};
 
@@ -20,6 +23,8 @@ pub struct Arguments {
     /// Folder of the service's data; the service may be running.
     #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
     data: PathBuf,
+    #[command(flatten)]
+    audit: AuditArguments,
     #[command(subcommand)]
     action: Action,
 }
@@ -65,8 +70,9 @@ struct Create {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
+        let log = audit_log(&arguments.audit, &arguments.data)?;
         let store = open(arguments).await?;
-        let text = act(&store, &arguments.action).await?;
+        let text = act(&store, &log, &arguments.action).await?;
         // This makes earlier copies of the database, which have other tokens, recognizable.
         if !matches!(arguments.action, Action::List) {
             store.advance_generation().await?;
@@ -92,22 +98,31 @@ async fn open(arguments: &Arguments) -> Result<Store> {
     }
 }
 
-async fn act(store: &Store, action: &Action) -> Result<String> {
+async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
     match action {
-        Action::Create(create) => make(store, create).await,
+        Action::Create(create) => {
+            let id = TokenId::new();
+            let object = id.to_string();
+            let change = Change { action: "token create", lab: Some(create.lab.clone()), object };
+            audited(log, change, make(store, id, create)).await
+        }
         Action::List => Ok(table(&store.tokens().await?)),
         Action::Revoke { id } => {
-            store.revoke_token(*id).await?;
+            let tokens = store.tokens().await?;
+            let token = tokens.into_iter().map(|(token, _)| token).find(|token| token.id == *id);
+            let lab = token.map(|token| token.lab);
+            let change = Change { action: "token revoke", lab, object: id.to_string() };
+            audited(log, change, async { Ok(store.revoke_token(*id).await?) }).await?;
             Ok(format!("revoked {id}"))
         }
     }
 }
 
-async fn make(store: &Store, create: &Create) -> Result<String> {
+async fn make(store: &Store, id: TokenId, create: &Create) -> Result<String> {
     let secret = Secret::random()
         .map_err(|error| CliError::Failure(format!("no random numbers: {error}")))?;
     let token = Token {
-        id: TokenId::new(),
+        id,
         lab: create.lab.clone(),
         role: create.role,
         all_labs: create.all_labs,

@@ -3,7 +3,7 @@
 //! A service for which no token was ever made is open; all data are the lab `local`'s then.
 
 use std::net::IpAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use axum::body::{Body, HttpBody};
@@ -18,15 +18,22 @@ use headers::authorization::{Authorization, Bearer};
 use headers::{Cookie, HeaderMapExt};
 use rustix::system::uname;
 
+use super::client::Client;
 use super::error::{ApiError, Code, Result};
 use super::rate::Rates;
 use super::revocation::{Grant, Revocations};
+use super::sign_ins::SignIns;
+use crate::audit::AuditLog;
 use crate::config::ServeArguments;
-use engine::job::{Lab, Role, Secret, Timestamp, TokenId};
+use engine::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use store::{Store, Token};
 
-/// The cookie of a session, which `POST /view/session` sets.
+/// The cookie of a session, which `POST /view/session` sets on HTTP.
 pub(super) const SESSION: &str = "sci_recon_session";
+/// The cookie on HTTPS: the browser accepts it from this host alone, not from another one of the same domain.
+pub(super) const HOST_SESSION: &str = "__Host-sci_recon_session";
+/// The cookie on HTTPS below a path prefix, where browsers allow no `__Host-`: it comes from a page on HTTPS.
+pub(super) const SECURE_SESSION: &str = "__Secure-sci_recon_session";
 /// What changes something by a session has this header: a page of another site can't set it.
 const CHANGES: &str = "x-requested-with";
 
@@ -71,6 +78,8 @@ pub(super) struct Access {
     /// True if they were, on a route that shows them together.
     pub(super) across: bool,
     pub(super) token: Option<TokenId>,
+    /// The note of the token.
+    pub(super) note: Option<Label>,
     /// Bytes of uploads, and of what is prepared of them, that the token may keep here.
     pub(super) max_bytes: Option<u64>,
     /// From when on the token is worth nothing.
@@ -88,15 +97,16 @@ impl Access {
             all_labs: true,
             across: false,
             token: None,
+            note: None,
             max_bytes: None,
             expires_at: None,
             session: None,
         }
     }
     fn of(token: Token, session: Option<Secret>) -> Self {
-        let Token { id, lab, role, all_labs, max_bytes, expires_at, .. } = token;
+        let Token { id, lab, role, all_labs, note, max_bytes, expires_at, .. } = token;
         let token = Some(id);
-        Self { lab, role, all_labs, across: false, token, max_bytes, expires_at, session }
+        Self { lab, role, all_labs, across: false, token, note, max_bytes, expires_at, session }
     }
 
     fn grant(&self) -> Grant {
@@ -113,6 +123,25 @@ impl Access {
     }
 }
 
+/// The access that the guard grants to a request, for the layers around the guard.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Admitted(Arc<Mutex<Option<Access>>>);
+
+impl Admitted {
+    pub(super) fn set(&self, access: &Access) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(access.clone());
+    }
+
+    pub(super) fn get(&self) -> Option<Access> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// The slot of a request.
+    pub(super) fn of(request: &Request) -> Self {
+        request.extensions().get().cloned().unwrap_or_default()
+    }
+}
+
 impl<S: Send + Sync> FromRequestParts<S> for Access {
     type Rejection = ApiError;
 
@@ -122,18 +151,24 @@ impl<S: Send + Sync> FromRequestParts<S> for Access {
     }
 }
 
-/// The limits of the guard: names and origins that tell own pages from those of other sites, and the rate of requests.
+/// The limits of the guard: names and origins that distinguish own pages from those of other sites, and the rates of
+/// requests and of failed sign-ins.
 #[derive(Debug)]
 pub(super) struct Sites {
     hosts: Vec<String>,
     origins: Vec<HeaderValue>,
-    rates: Rates,
+    rates: Rates<TokenId>,
+    sign_ins: SignIns,
 }
 
 impl Sites {
-    pub(super) fn new(settings: &ServeArguments) -> Self {
-        let rates = Rates::new(settings.requests_per_minute);
-        Self { hosts: settings.hosts.clone(), origins: settings.cors_origins.clone(), rates }
+    pub(super) fn new(settings: &ServeArguments, audit: AuditLog) -> Self {
+        Self {
+            hosts: settings.hosts.clone(),
+            origins: settings.cors_origins.clone(),
+            rates: Rates::new(settings.requests_per_minute),
+            sign_ins: SignIns::new(audit),
+        }
     }
 }
 
@@ -147,9 +182,11 @@ pub(super) async fn guard(
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
     match admit((&store, &sites), (rule, role), &mut request).await {
         Ok(access) => {
+            Admitted::of(&request).set(&access);
             tracing::Span::current().record("lab", access.lab.as_str());
             let rate = access.token.and_then(|token| sites.rates.take(token, Instant::now()));
-            let refusal = rate.and_then(|rate| rate.check().err());
+            let may = |quota| format!("the token may send {quota} requests");
+            let refusal = rate.and_then(|rate| rate.check(may).err());
             request.extensions_mut().insert(access.clone());
             let mut response = match refusal {
                 Some(refusal) => refusal.into_response(),
@@ -158,6 +195,9 @@ pub(super) async fn guard(
             if let Some(rate) = rate {
                 rate.state(response.headers_mut());
             }
+            // A browser must not show data after the end of a session.
+            let cached = response.headers_mut().entry(header::CACHE_CONTROL);
+            cached.or_insert(HeaderValue::from_static("private, no-cache"));
             if response.body().size_hint().exact().is_some() {
                 return response;
             }
@@ -176,11 +216,13 @@ async fn admit(
     request: &mut Request,
 ) -> Result<Access> {
     let (method, headers) = (request.method(), request.headers());
-    let found = match credential(headers) {
-        Some(Credential::Token(secret)) => store.token(&secret).await?.map(|token| (token, None)),
+    let is_https = request.extensions().get::<Client>().is_some_and(|client| client.is_https);
+    let shown = credential(headers, is_https);
+    let found = match &shown {
+        Some(Credential::Token(secret)) => store.token(secret).await?.map(|token| (token, None)),
         Some(Credential::Session(secret)) => {
-            let token = store.token_of_session(&secret).await?;
-            token.map(|token| (token, Some(secret)))
+            let token = store.token_of_session(secret).await?;
+            token.map(|token| (token, Some(secret.clone())))
         }
         None => None,
     };
@@ -191,8 +233,14 @@ async fn admit(
             let access = Access::open();
             return choose_lab(store, rule, access, request).await;
         }
+        if shown.is_some() || headers.contains_key(header::AUTHORIZATION) {
+            let client = request.extensions().get::<Client>().copied();
+            sites.sign_ins.failed(client, (method, request.uri().path(), headers))?;
+        }
         return Err(missing());
     };
+    // A refusal is recorded with the token.
+    Admitted::of(request).set(&Access::of(token.clone(), session.clone()));
     if session.is_some() && !method.is_safe() {
         check_site(method, headers, &[])?;
         if !headers.contains_key(CHANGES) {
@@ -329,12 +377,17 @@ enum Credential {
     Session(Secret),
 }
 
-fn credential(headers: &HeaderMap) -> Option<Credential> {
+/// The credential of a request. A cookie without a prefix may have been set by another host of the domain, so one is not
+/// accepted on HTTPS.
+fn credential(headers: &HeaderMap, is_https: bool) -> Option<Credential> {
     if let Some(bearer) = headers.typed_try_get::<Authorization<Bearer>>().transpose() {
         return Secret::parse(bearer.ok()?.token().trim()).map(Credential::Token);
     }
     let cookies = headers.typed_get::<Cookie>()?;
-    Secret::parse(cookies.get(SESSION)?).map(Credential::Session)
+    let plain = || cookies.get(SESSION).filter(|_| !is_https);
+    let session =
+        cookies.get(HOST_SESSION).or_else(|| cookies.get(SECURE_SESSION)).or_else(plain)?;
+    Secret::parse(session).map(Credential::Session)
 }
 
 /// The same for a token that is missing, unknown, misspelled or revoked.
@@ -350,7 +403,14 @@ pub(super) fn missing() -> ApiError {
 mod tests {
     use axum::http::{HeaderMap, HeaderValue, Method};
 
-    use super::{Credential, SESSION, Secret, check_name, check_site, credential, without_lab};
+    use super::{
+        Credential, HOST_SESSION, SECURE_SESSION, SESSION, Secret, check_name, check_site,
+        without_lab,
+    };
+
+    fn credential(headers: &HeaderMap) -> Option<Credential> {
+        super::credential(headers, false)
+    }
 
     fn headers(name: &'static str, value: &str) -> HeaderMap {
         HeaderMap::from_iter([(name.parse().unwrap(), HeaderValue::from_str(value).unwrap())])
@@ -396,7 +456,15 @@ mod tests {
         let bearer = headers("authorization", &format!("bearer {text}"));
         assert_eq!(credential(&bearer), Some(Credential::Token(token.clone())));
         let mut both = headers("cookie", &format!("a=b; {SESSION}={}; c=d", session.reveal()));
-        assert_eq!(credential(&both), Some(Credential::Session(session)));
+        assert_eq!(credential(&both), Some(Credential::Session(session.clone())));
+        assert_eq!(super::credential(&both, true), None, "another host may have set it");
+        for name in [HOST_SESSION, SECURE_SESSION] {
+            let planted = format!("{SESSION}={text}; {name}={}", session.reveal());
+            let cookies = headers("cookie", &planted);
+            let expected = Some(Credential::Session(session.clone()));
+            assert_eq!(super::credential(&cookies, true), expected);
+            assert_eq!(credential(&cookies), expected);
+        }
         both.extend(bearer);
         assert_eq!(credential(&both), Some(Credential::Token(token.clone())));
         for bad in [format!("Basic {text}"), text.to_owned(), "Bearer".into(), "Bearer x".into()] {

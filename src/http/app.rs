@@ -12,16 +12,20 @@ use super::context::Wait;
 use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
+use super::rate::Rates;
 use super::rendering::Pictures;
 use super::revocation::Revocations;
-use super::shares::Turns;
+use super::shares::{Changes, Turns};
+use crate::audit::AuditLog;
 use crate::config::ServeArguments;
-use engine::job::{Timestamp, without_paths};
+use engine::job::{Timestamp, TokenId, without_paths};
 use formats::Limits;
 use store::Store;
 
 /// Labs for which a file is read at the same time, so that a slow one keeps no other lab waiting.
 const READS_AT_ONCE: usize = 4;
+/// Sessions that a token may begin in a minute. Each one writes to the database.
+const SESSIONS_PER_MINUTE: u32 = 20;
 /// Requests of a lab that may wait for a file to be read.
 const READS: usize = 32;
 
@@ -34,13 +38,13 @@ pub struct App(Arc<Services>);
 pub struct Services {
     pub(super) store: Store,
     pub(super) settings: ServeArguments,
+    pub(super) audit: AuditLog,
     pub(super) started_at: Timestamp,
     pub(super) limits: Limits,
     pub(super) admission: Admission,
     /// Each read takes a core and a frame of memory; a lab has one at a time.
     pub(super) intake: Turns,
-    /// Held by requests that change something, from the check of their condition to the change.
-    pub(super) changes: Mutex<()>,
+    pub(super) changes: Changes,
     /// Ends what has no end of its own.
     pub(super) closing: CancellationToken,
     /// When it was last tried whether files can be written, and what came of it.
@@ -48,6 +52,8 @@ pub struct Services {
     pub(super) metrics: Metrics,
     pub(super) events: Events,
     pub(super) revocations: Revocations,
+    /// The rate at which each token begins sessions.
+    pub(super) session_rates: Rates<TokenId>,
     pub(super) pictures: Pictures,
     /// Why no tile can leave this machine, where tiles should.
     pub(super) cluster: Option<watch::Receiver<Option<String>>>,
@@ -61,7 +67,7 @@ impl App {
     /// have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
-        settings: &ServeArguments,
+        (settings, audit): (&ServeArguments, AuditLog),
         metrics: Metrics,
         (cluster, confinement): (
             Option<watch::Receiver<Option<String>>>,
@@ -72,18 +78,20 @@ impl App {
         Self(Arc::new(Services {
             events: Events::start(store.clone(), closing.clone()),
             revocations: Revocations::start(store.clone()),
+            session_rates: Rates::new(SESSIONS_PER_MINUTE),
             pictures: Pictures::new(),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
             intake: Turns::new(READS_AT_ONCE, READS),
-            changes: Mutex::default(),
+            changes: Changes::default(),
             closing,
             disk_tried: Mutex::default(),
             metrics,
             cluster,
             confinement,
             settings: settings.clone(),
+            audit,
             store,
         }))
     }

@@ -140,7 +140,8 @@ pub(super) async fn delete(
     Params(sha256): Params<Sha256>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard = request.precondition(&app.changes, body(&app, &access, sha256)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access, sha256)).await?;
     app.store.delete_upload(&access.lab, sha256).await?;
     Ok(StatusCode::NO_CONTENT)
 }
@@ -153,11 +154,22 @@ async fn begin(
     headers: &HeaderMap,
 ) -> Result<(shares::Place, Reservation)> {
     check_encoding(headers)?;
+    check_whole(headers)?;
     content_digest(headers)?;
     let slot = app.admission.place(&access.lab)?;
     let length = headers.typed_get::<ContentLength>().map_or(0, |length| length.0);
     app.admission.check_length(access, length).await?;
     Ok((slot, app.admission.reserve(&access.lab, length).await?))
+}
+
+/// Refuses a part of a file, which would be stored as a file (RFC 9110, 14.5).
+fn check_whole(headers: &HeaderMap) -> Result<()> {
+    if !headers.contains_key(header::CONTENT_RANGE) {
+        return Ok(());
+    }
+    let detail = "Content-Range announces a part of a file, but this request stores its body as a whole file; send the \
+                  whole file, or send it in pieces to /v1/uploads";
+    Err(ApiError::new(Code::MalformedRequest, detail))
 }
 
 /// Reads the rest of a small body before the error is sent. Some clients read the answer only after they sent the body.

@@ -46,7 +46,7 @@ pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -
     if let Err(error) = check_match(headers, &etag) {
         return error.into_response();
     }
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "no-cache".into())];
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "private, no-cache".into())];
     if is_known(headers, &etag) {
         return (StatusCode::NOT_MODIFIED, tags).into_response();
     }

@@ -8,10 +8,12 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, Uri, header};
 use axum::response::Response;
 use serde::Serialize;
-use tokio::sync::{Mutex, MutexGuard};
+use tokio::sync::OwnedMutexGuard;
 
 use super::conditional;
 use super::error::{ApiError, Result};
+use super::shares::Changes;
+use engine::job::Lab;
 
 const PREFER: HeaderName = HeaderName::from_static("prefer");
 const APPLIED: HeaderName = HeaderName::from_static("preference-applied");
@@ -65,14 +67,14 @@ impl RequestContext {
         format!("<?{}>; rel=\"next\"", query.join("&"))
     }
 
-    /// Checks `If-Match` of a request that changes or deletes something; `current` gives its representation. `changes` is
-    /// the lock of all such requests: no other one changes anything until the guard is dropped.
-    pub(super) async fn precondition<'a, T: Serialize>(
+    /// Checks `If-Match` of a request that changes or deletes something; `current` gives its representation. No
+    /// other request changes anything of the lab until the guard is dropped.
+    pub(super) async fn precondition<T: Serialize>(
         &self,
-        changes: &'a Mutex<()>,
+        (changes, lab): (&Changes, &Lab),
         current: impl Future<Output = Result<T>>,
-    ) -> Result<MutexGuard<'a, ()>> {
-        let guard = changes.lock().await;
+    ) -> Result<OwnedMutexGuard<()>> {
+        let guard = changes.lock(lab).await;
         if self.headers.contains_key(header::IF_MATCH) {
             conditional::check_match(&self.headers, &conditional::etag_of(&current.await?)?)?;
         }

@@ -421,7 +421,8 @@ pub(super) async fn change(
     if let Some(error) = invalid {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
-    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.change_job(&access.lab, id, &JobChanges { label, priority }).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
@@ -450,7 +451,8 @@ pub(super) async fn cancel(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<Response> {
-    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.cancel_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
@@ -460,7 +462,8 @@ pub(super) async fn retry(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<Response> {
-    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.retry_job(&access.lab, id).await?;
     accepted(&app, &access.lab, id).await
 }
@@ -476,7 +479,8 @@ pub(super) async fn delete(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

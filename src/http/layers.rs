@@ -14,6 +14,7 @@ use tracing::Instrument;
 use tracing::field::Empty;
 use uuid::Uuid;
 
+use super::access::Admitted;
 use super::context::relative;
 use super::error::{ApiError, Code, REQUEST_ID};
 use super::metrics;
@@ -28,13 +29,16 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let route = request.extensions().get::<MatchedPath>().map(|route| route.as_str().to_owned());
     let span = tracing::info_span!("request", id = id.to_str().unwrap_or(""), %method, path = %path, lab = Empty);
+    let admitted = Admitted::default();
+    request.extensions_mut().insert(admitted.clone());
     let start = Instant::now();
     let answer = next.run(request).instrument(span.clone());
     let mut response = REQUEST_ID.scope(id.to_str().unwrap_or("").to_owned(), answer).await;
     let (status, took) = (response.status().as_u16(), start.elapsed());
-    // A status that everyone polls for is not worth a line each.
+    // A status that everyone polls for is not worth a line each. Strangers must not fill the log.
     let _entered = span.enter();
-    if is_quiet(&method, &path) {
+    let is_stranger = admitted.get().is_none() && !response.status().is_server_error();
+    if is_stranger || is_quiet(&method, &path) {
         tracing::debug!(status, ms = took.as_millis(), "answered");
     } else {
         tracing::info!(status, ms = took.as_millis(), "answered");

@@ -1,9 +1,7 @@
 //! The connections: how many there may be, how long they may be silent, and how slow.
 
-use std::collections::HashMap;
 use std::convert::Infallible;
-use std::net::IpAddr;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
@@ -11,22 +9,24 @@ use axum::response::Response;
 use hyper::Request;
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
+use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
-use hyper_util::service::TowerToHyperService;
+use ipnet::IpNet;
 use rustix::process::{Resource, getrlimit, setrlimit};
 use socket2::SockRef;
 use tokio::net::{TcpListener, TcpStream};
 use tower::ServiceExt;
 
+use super::client::Client;
+use super::client_places::Places;
+use super::throttle::Throttle;
 use super::write_deadline::{LeastRate, WriteDeadline};
 use crate::config::ServeArguments;
 
 /// A connection that sends no whole head of a request for so long is closed, the first one and between
 /// two requests.
 const SILENCE: Duration = Duration::from_secs(30);
-/// Connections of one address, such as that of a proxy or of a lab behind one; more are closed at once.
-const MOST_OF_AN_ADDRESS: usize = 2048;
 /// Unsent bytes of a connection that the kernel takes from us. With megabytes, as is the kernel's default, it would take
 /// nothing for minutes from a connection with a slow client, as from one that stands still.
 const UNSENT_BYTES: u32 = 64 * 1024;
@@ -42,9 +42,10 @@ pub async fn listen(
 ) {
     let (rate, time) = (settings.download_bytes_per_second, settings.download_stall());
     let least = LeastRate { bytes: rate.saturating_mul(time.as_secs()), time };
-    let places = Places::new(raise_file_limit());
+    let places = Places::new(connection_limit());
+    let proxies: Arc<[IpNet]> = settings.trusted_proxies.as_slice().into();
+    let refusals = Throttle::default();
     let service = ServiceExt::<Request<Incoming>>::map_result(router, cut);
-    let service = TowerToHyperService::new(service);
     let mut http = http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(SILENCE);
     let graceful = GracefulShutdown::new();
@@ -63,11 +64,24 @@ pub async fn listen(
                 continue;
             }
         };
-        let Some(place) = places.take(address.ip()) else {
-            tracing::warn!(%address, "too many connections");
+        let peer = address.ip();
+        let is_proxy = proxies.iter().any(|net| net.contains(&peer.to_canonical()));
+        // The connections of a proxy serve many clients, so requests are counted instead.
+        let place = if is_proxy { places.take_any(peer) } else { places.take(peer) };
+        let Some(place) = place else {
+            refusals.pass(
+                || tracing::warn!(%address, "too many connections"),
+                |left_out| tracing::warn!(left_out, "too many connections"),
+            );
             continue;
         };
-        let connection = graceful.watch(http.serve_connection(io(stream, least), service.clone()));
+        let (service, proxies) = (service.clone(), proxies.clone());
+        let with_client = service_fn(move |mut request: Request<Incoming>| {
+            let client = Client::of(peer, request.headers(), &proxies);
+            request.extensions_mut().insert(client);
+            service.clone().oneshot(request)
+        });
+        let connection = graceful.watch(http.serve_connection(io(stream, least), with_client));
         tokio::spawn(async move {
             if let Err(error) = connection.await {
                 tracing::debug!(%error, "a connection broke");
@@ -107,6 +121,12 @@ fn io(stream: TcpStream, least: LeastRate) -> TokioIo<WriteDeadline<TcpStream>> 
     TokioIo::new(WriteDeadline::new(stream, least))
 }
 
+/// The number of connections that the limit on open files allows.
+pub(super) fn connection_limit() -> usize {
+    let most = raise_file_limit().saturating_sub(OTHER_FILES).max(1);
+    usize::try_from(most).unwrap_or(usize::MAX)
+}
+
 /// Allows as many open files as the system does, and says how many those are.
 fn raise_file_limit() -> u64 {
     let mut limit = getrlimit(Resource::Nofile);
@@ -115,76 +135,4 @@ fn raise_file_limit() -> u64 {
         tracing::warn!(%error, "the limit on open files stays as it is");
     }
     getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX)
-}
-
-/// The connections there are.
-#[derive(Debug, Clone)]
-struct Places {
-    most: usize,
-    taken: Arc<Mutex<HashMap<IpAddr, usize>>>,
-}
-
-/// A connection among them, until it is dropped.
-#[derive(Debug)]
-struct Place {
-    places: Places,
-    address: IpAddr,
-}
-
-impl Places {
-    fn new(files: u64) -> Self {
-        let most = files.saturating_sub(OTHER_FILES).max(1);
-        Self { most: usize::try_from(most).unwrap_or(usize::MAX), taken: Arc::default() }
-    }
-
-    fn take(&self, address: IpAddr) -> Option<Place> {
-        let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        let all: usize = taken.values().sum();
-        // Who is refused leaves no entry behind.
-        let own = taken.get(&address).copied().unwrap_or(0);
-        if all >= self.most || own >= MOST_OF_AN_ADDRESS {
-            return None;
-        }
-        taken.insert(address, own + 1);
-        Some(Place { places: self.clone(), address })
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        let mut taken = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(own) = taken.get_mut(&self.address) {
-            *own -= 1;
-            if *own == 0 {
-                taken.remove(&self.address);
-            }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{MOST_OF_AN_ADDRESS, OTHER_FILES, Places};
-
-    #[test]
-    fn one_address_leaves_places_for_others() {
-        let places = Places::new(1 << 20);
-        let (one, other) = ("10.0.0.1".parse().unwrap(), "10.0.0.2".parse().unwrap());
-        let mut held: Vec<_> = (0..MOST_OF_AN_ADDRESS).map(|_| places.take(one).unwrap()).collect();
-        assert!(places.take(one).is_none());
-        assert!(places.take(other).is_some());
-        held.pop();
-        assert!(places.take(one).is_some());
-    }
-
-    #[test]
-    fn connections_leave_files_for_the_rest() {
-        let places = Places::new(OTHER_FILES + 2);
-        let address = "10.0.0.1".parse().unwrap();
-        let held = (places.take(address), places.take(address));
-        assert!(held.0.is_some() && held.1.is_some() && places.take(address).is_none());
-        assert!(places.take("10.0.0.2".parse().unwrap()).is_none());
-        drop(held);
-        assert!(places.taken.lock().unwrap().is_empty());
-    }
 }

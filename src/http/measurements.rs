@@ -178,7 +178,8 @@ pub(super) async fn rename(
     request: RequestContext,
     Body(renaming): Body<Renaming>,
 ) -> Result<Response> {
-    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.rename_measurement(&access.lab, id, renaming.name.as_ref()).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
@@ -188,7 +189,8 @@ pub(super) async fn delete(
     Params(id): Params<MeasurementId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard = request.precondition(&app.changes, body(&app, &access.lab, id)).await?;
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.delete_measurement(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -1,13 +1,13 @@
-//! The rate of requests of each token: a bucket that fills steadily and from which every request takes one.
+//! The rate of requests of each token or address: a bucket that fills steadily and from which every request takes one.
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::http::{HeaderMap, HeaderName, HeaderValue, header};
 
 use super::error::{ApiError, Code};
-use engine::job::TokenId;
 
 const LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 const POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
@@ -16,11 +16,11 @@ const WINDOW: Duration = Duration::from_secs(60);
 /// Buckets above which full ones are forgotten.
 const MANY: usize = 1000;
 
-/// Requests that each token may send in a minute; 0: no limit.
+/// Requests that each client, identified by `K`, may send in a minute; 0: no limit.
 #[derive(Debug, Clone)]
-pub(super) struct Rates {
+pub(super) struct Rates<K> {
     quota: u32,
-    buckets: Arc<Mutex<HashMap<TokenId, Bucket>>>,
+    buckets: Arc<Mutex<HashMap<K, Bucket>>>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -30,20 +30,20 @@ struct Bucket {
     at: Instant,
 }
 
-/// The state of a token's bucket after a request.
+/// The state of a client's bucket after a request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Rate {
     quota: u32,
     level: f64,
 }
 
-impl Rates {
+impl<K: Eq + Hash> Rates<K> {
     pub(super) fn new(quota: u32) -> Self {
         Self { quota, buckets: Arc::default() }
     }
 
-    /// Takes a request of this token from its bucket; none if requests are not limited.
-    pub(super) fn take(&self, token: TokenId, now: Instant) -> Option<Rate> {
+    /// Takes a request of this client from its bucket; `None` if requests are not limited.
+    pub(super) fn take(&self, client: K, now: Instant) -> Option<Rate> {
         if self.quota == 0 {
             return None;
         }
@@ -56,7 +56,7 @@ impl Rates {
         if buckets.len() > MANY {
             buckets.retain(|_, bucket| filled(bucket) < quota);
         }
-        let bucket = buckets.entry(token).or_insert(Bucket { level: quota, at: now });
+        let bucket = buckets.entry(client).or_insert(Bucket { level: quota, at: now });
         let level = filled(bucket) - 1.0;
         // A refused request takes nothing, so that a client that goes on asking gets its turn.
         *bucket = Bucket { level: if level < 0.0 { level + 1.0 } else { level }, at: now };
@@ -65,16 +65,15 @@ impl Rates {
 }
 
 impl Rate {
-    /// Refuses the request if the bucket is empty, with the time until it has one.
-    pub(super) fn check(self) -> Result<(), ApiError> {
+    /// Refuses the request if the bucket is empty, with the time until it has one. `what` phrases the quota, such as
+    /// "the token may send 10 requests".
+    pub(super) fn check(self, what: impl FnOnce(u32) -> String) -> Result<(), ApiError> {
         if self.level >= 0.0 {
             return Ok(());
         }
         let seconds = self.seconds_to(0.0);
-        let detail = format!(
-            "the token may send {} requests in a minute; the next one is accepted in {seconds} seconds",
-            self.quota
-        );
+        let what = what(self.quota);
+        let detail = format!("{what} in a minute; the next one is accepted in {seconds} seconds");
         Err(ApiError::new(Code::RateLimited, detail)
             .with_header(header::RETRY_AFTER, seconds.into()))
     }
@@ -111,7 +110,8 @@ mod tests {
     fn a_bucket_empties_and_fills() {
         let (rates, one, other) = (Rates::new(60), TokenId::new(), TokenId::new());
         let start = Instant::now();
-        let allowed = |token, at| rates.take(token, at).unwrap().check().is_ok();
+        let allowed =
+            |token, at| rates.take(token, at).unwrap().check(|quota| quota.to_string()).is_ok();
         assert_eq!((0..100).filter(|_| allowed(one, start)).count(), 60);
         assert!(allowed(other, start), "each token has its own");
         let mut fields = HeaderMap::new();

@@ -17,11 +17,13 @@ use tower_http::cors::{AllowHeaders, CorsLayer};
 
 use super::access::{self, Rule};
 use super::app::App;
+use super::client_places::{self, Places};
+use super::listen::connection_limit;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
-    algorithms, blobs, calibrations, contract, dashboard, events, exports, jobs, labs, layers, me,
-    measurements, models, pictures, problems, quality, reports, results, samples, session, system,
-    tiles, tus,
+    algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
+    layers, me, measurements, models, pictures, problems, quality, reports, results, samples,
+    session, system, tiles, tus,
 };
 
 /// Time for which a browser remembers what another origin may do.
@@ -52,7 +54,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/algorithms").get(algorithms::list),
         R::at("/v1/jobs").get(jobs::list).post(jobs::create).only(Rule::AcrossLabs),
         R::at("/v1/samples").post(samples::create),
-        R::at("/v1/jobs/estimate").post(jobs::estimate),
+        R::at("/v1/jobs/estimate").post(jobs::estimate).changes_nothing(),
         R::at("/v1/jobs/{job}").get(jobs::show).patch(jobs::change).delete(jobs::delete),
         R::at("/v1/jobs/{job}/cancel").post(jobs::cancel),
         R::at("/v1/jobs/{job}/retry").post(jobs::retry),
@@ -100,7 +102,7 @@ pub fn router(app: App) -> Router {
     let late = HandleErrorLayer::new(move |_: BoxError| async move { layers::timed_out(seconds) });
     let timeout = ServiceBuilder::new().layer(late).timeout(app.settings.request_time());
     let close = map_response(layers::close_after_refusal);
-    let sites = Arc::new(access::Sites::new(&app.settings));
+    let sites = Arc::new(access::Sites::new(&app.settings, app.audit.clone()));
     let mut router = Router::new();
     for route in routes() {
         let (store, revocations) = (app.store.clone(), app.revocations.clone());
@@ -108,7 +110,9 @@ pub fn router(app: App) -> Router {
             from_fn_with_state((store, sites.clone(), revocations, route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
+        let record = from_fn_with_state((app.audit.clone(), route.path), audit::record);
         let handlers = handlers.route_layer(guard);
+        let handlers = if route.is_pure { handlers } else { handlers.route_layer(record) };
         let handlers = if route.uploads { handlers.layer(close.clone()) } else { handlers };
         router = router.route(route.path, handlers);
     }
@@ -118,6 +122,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(layers::method_not_allowed)
         .layer(DefaultBodyLimit::max(JSON_BYTES))
         .layer(CatchPanicLayer::custom(layers::panicked))
+        .layer(from_fn_with_state(Places::new(connection_limit()), client_places::limit))
         .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::relative_references))
         .layer(from_fn(layers::observe))
@@ -159,6 +164,7 @@ pub struct Route {
     pub(super) rule: Rule,
     slow: bool,
     uploads: bool,
+    is_pure: bool,
 }
 
 impl Route {
@@ -170,6 +176,7 @@ impl Route {
             rule: Rule::ByMethod,
             slow: false,
             uploads: false,
+            is_pure: false,
         }
     }
 
@@ -216,6 +223,12 @@ impl Route {
     /// For others than those who read or submit data of a lab.
     fn only(mut self, rule: Rule) -> Self {
         self.rule = rule;
+        self
+    }
+
+    /// No method changes anything, so requests are not recorded in the audit log.
+    fn changes_nothing(mut self) -> Self {
+        self.is_pure = true;
         self
     }
 

@@ -1,13 +1,14 @@
 //! `/view/session`: exchanges a token for a cookie that scripts cannot read.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use axum::Json;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use serde::{Deserialize, Serialize};
 
-use super::access::{SESSION, missing};
+use super::access::{HOST_SESSION, SECURE_SESSION, SESSION, missing};
+use super::client::Client;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, QueryOf};
 use engine::job::{Secret, Timestamp, TokenId};
@@ -56,6 +57,7 @@ impl TryFrom<String> for CookiePath {
 pub(super) async fn create(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<SessionQuery>,
+    client: Option<Extension<Client>>,
     headers: HeaderMap,
 ) -> Result<Response> {
     let Some(token) = access.token else {
@@ -66,13 +68,17 @@ pub(super) async fn create(
     if access.session.is_some() {
         return Err(missing());
     }
+    if let Some(rate) = app.session_rates.take(token, Instant::now()) {
+        rate.check(|quota| format!("the token may begin {quota} sessions"))?;
+    }
     let secret = Secret::random().map_err(|error| ApiError::internal(&error))?;
     let now = Timestamp::now();
     let end = now.after(LIFE);
     let expires_at = access.expires_at.map_or(end, |expires| expires.min(end));
     app.store.add_session(token, &secret, expires_at).await?;
     let seconds = (expires_at.0 - now.0).max(0) / 1000;
-    let cookie = cookie(&headers, &query.path, secret.reveal(), seconds);
+    let is_https = is_https(client, &headers);
+    let cookie = cookie(is_https, &query.path, secret.reveal(), seconds);
     let body = Json(SessionBody { token, expires_at });
     Ok((StatusCode::CREATED, [(header::SET_COOKIE, cookie)], body).into_response())
 }
@@ -81,19 +87,29 @@ pub(super) async fn create(
 pub(super) async fn delete(
     Caller(app, access): Caller,
     QueryOf(query): QueryOf<SessionQuery>,
+    client: Option<Extension<Client>>,
     headers: HeaderMap,
 ) -> Result<Response> {
     if let Some(secret) = &access.session {
         app.store.end_session(secret).await?;
     }
-    let cookie = cookie(&headers, &query.path, "", 0);
+    let cookie = cookie(is_https(client, &headers), &query.path, "", 0);
     Ok((StatusCode::NO_CONTENT, [(header::SET_COOKIE, cookie)]).into_response())
 }
 
-fn cookie(headers: &HeaderMap, CookiePath(path): &CookiePath, value: &str, seconds: i64) -> String {
-    // TLS ends at a proxy; the browser says what it sees.
+/// True if the browser uses HTTPS, which ends at a proxy. The proxy says so if it is trusted, else the browser in
+/// `Origin`.
+fn is_https(client: Option<Extension<Client>>, headers: &HeaderMap) -> bool {
     let origin = headers.get(header::ORIGIN).and_then(|origin| origin.to_str().ok());
-    let secure = origin.is_some_and(|origin| origin.starts_with("https://"));
-    let secure = if secure { "; Secure" } else { "" };
-    format!("{SESSION}={value}; Path={path}; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}")
+    client.is_some_and(|Extension(client)| client.is_https)
+        || origin.is_some_and(|origin| origin.starts_with("https://"))
+}
+
+fn cookie(is_https: bool, CookiePath(path): &CookiePath, value: &str, seconds: i64) -> String {
+    let (name, secure) = match (is_https, path.as_str()) {
+        (true, "/") => (HOST_SESSION, "; Secure"),
+        (true, _) => (SECURE_SESSION, "; Secure"),
+        (false, _) => (SESSION, ""),
+    };
+    format!("{name}={value}; Path={path}; Max-Age={seconds}; HttpOnly; SameSite=Strict{secure}")
 }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Mutex as AsyncMutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
 use super::error::{ApiError, Code, Result};
 use engine::job::Lab;
@@ -59,7 +59,7 @@ impl Drop for Place {
 #[derive(Debug)]
 pub(super) struct Turns {
     all: Arc<Semaphore>,
-    of_labs: Mutex<HashMap<Lab, Weak<Semaphore>>>,
+    of_labs: PerLab<Semaphore>,
     waiting: Places,
 }
 
@@ -76,7 +76,7 @@ impl Turns {
     /// `at_once` items run at the same time, and `waiting` items of a lab may wait or run.
     pub(super) fn new(at_once: usize, waiting: usize) -> Self {
         let waiting = Places { most: usize::MAX, of_a_lab: waiting, taken: Arc::default() };
-        Self { all: Arc::new(Semaphore::new(at_once)), of_labs: Mutex::default(), waiting }
+        Self { all: Arc::new(Semaphore::new(at_once)), of_labs: PerLab::default(), waiting }
     }
 
     /// Waits for the lab's turn.
@@ -90,18 +90,43 @@ impl Turns {
             )
         })?;
         let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
-        let of_lab = self.of_lab(lab).acquire_owned().await.map_err(stopped)?;
+        let of_lab =
+            self.of_labs.get(lab, || Semaphore::new(1)).acquire_owned().await.map_err(stopped)?;
         let all = self.all.clone().acquire_owned().await.map_err(stopped)?;
         Ok(Turn { _all: all, _of_lab: of_lab, _waiting: waiting })
     }
+}
 
-    fn of_lab(&self, lab: &Lab) -> Arc<Semaphore> {
-        let mut labs = self.of_labs.lock().unwrap_or_else(PoisonError::into_inner);
+/// The locks of requests that change something, one for each lab. A request holds it from the check of its condition to
+/// the change.
+#[derive(Debug, Default)]
+pub(super) struct Changes(PerLab<AsyncMutex<()>>);
+
+impl Changes {
+    /// Waits until no other request changes anything of this lab, and keeps others waiting until the guard is dropped.
+    pub(super) async fn lock(&self, lab: &Lab) -> OwnedMutexGuard<()> {
+        self.0.get(lab, AsyncMutex::default).lock_owned().await
+    }
+}
+
+/// A value for each lab, while something holds it.
+#[derive(Debug)]
+struct PerLab<T>(Mutex<HashMap<Lab, Weak<T>>>);
+
+impl<T> Default for PerLab<T> {
+    fn default() -> Self {
+        Self(Mutex::default())
+    }
+}
+
+impl<T> PerLab<T> {
+    fn get(&self, lab: &Lab, make: impl FnOnce() -> T) -> Arc<T> {
+        let mut labs = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(found) = labs.get(lab).and_then(Weak::upgrade) {
             return found;
         }
-        labs.retain(|_, turns| turns.strong_count() > 0);
-        let new = Arc::new(Semaphore::new(1));
+        labs.retain(|_, value| value.strong_count() > 0);
+        let new = Arc::new(make());
         labs.insert(lab.clone(), Arc::downgrade(&new));
         new
     }
@@ -109,7 +134,9 @@ impl Turns {
 
 #[cfg(test)]
 mod tests {
-    use super::{Lab, Places, Turns};
+    use futures_util::FutureExt;
+
+    use super::{Changes, Lab, Places, Turns};
 
     fn lab(name: &str) -> Lab {
         name.parse().unwrap()
@@ -161,5 +188,15 @@ mod tests {
             order[0] == "b" || order[1] == "b",
             "lab b does not wait for all items of lab a: {order:?}"
         );
+    }
+
+    #[tokio::test]
+    async fn changes_of_a_lab_wait_for_each_other_alone() {
+        let (changes, a, b) = (Changes::default(), lab("a"), lab("b"));
+        let first = changes.lock(&a).await;
+        assert!(changes.lock(&a).now_or_never().is_none());
+        assert!(changes.lock(&b).now_or_never().is_some());
+        drop(first);
+        assert!(changes.lock(&a).now_or_never().is_some());
     }
 }

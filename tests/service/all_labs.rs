@@ -207,7 +207,13 @@ async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
     for part in ["; HttpOnly", "; SameSite=Strict", "; Secure", "; Path=/", "; Max-Age=60480"] {
         assert!(cookie.contains(part), "{part}: {cookie}");
     }
-    assert!(!app.send(begin()).await.header("set-cookie").contains("Secure"));
+    assert!(cookie.starts_with("__Host-sci_recon_session="), "{cookie}");
+    let plain = app.send(begin()).await.header("set-cookie").to_owned();
+    assert!(plain.starts_with("sci_recon_session=") && !plain.contains("Secure"), "{plain}");
+    let below = app.request(Method::POST, "/view/session?path=/sci/");
+    let below = app.send(below.header("origin", "https://bench.example")).await;
+    let below = below.header("set-cookie");
+    assert!(below.starts_with("__Secure-sci_recon_session="), "{below}");
     app.sign_out();
     let session = cookie.split(';').next().unwrap().to_owned();
     assert!(!session.contains(a.trim_start_matches("sci_")));
@@ -243,6 +249,59 @@ async fn a_session_replaces_the_token_and_is_safe_from_other_sites() {
     let row = listed.lines().find(|line| line.contains("submit")).unwrap();
     app.token(&["revoke", row.split(' ').next().unwrap()]);
     app.send(list_jobs()).await.problem(401, "unauthorized");
+}
+
+/// Another host of the domain can set a cookie without a prefix, and so sign somebody in as itself.
+#[tokio::test]
+async fn behind_a_trusted_proxy_with_https_only_a_prefixed_cookie_counts() {
+    let app = TestApp::with(&["--workers", "0", "--trusted-proxies", "127.0.0.1"]).await;
+    let token = app.token(&["create", "--lab", "a"]);
+    let ask = |method: Method, path: &str, https: bool| {
+        let request = app.request(method, path).header("x-forwarded-for", "192.0.2.1");
+        if https { request.header("x-forwarded-proto", "https") } else { request }
+    };
+    let begin = async |https| {
+        let session = ask(Method::POST, "/view/session", https).bearer_auth(&token);
+        let session = app.send(session).await.expect(201);
+        session.header("set-cookie").split(';').next().unwrap().to_owned()
+    };
+    let (plain, prefixed) = (begin(false).await, begin(true).await);
+    assert!(prefixed.starts_with("__Host-"), "{prefixed}");
+    for (cookie, https, status) in [
+        (&plain, false, 200),
+        (&plain, true, 401),
+        (&prefixed, true, 200),
+        (&format!("{plain}; {prefixed}"), true, 200),
+    ] {
+        let list = ask(Method::GET, "/v1/jobs", https).header("cookie", cookie);
+        let answer = app.send(list).await;
+        assert_eq!(answer.status.as_u16(), status, "{cookie} {https}");
+        if status == 200 {
+            // A browser asks again, so it shows nothing after the end of the session.
+            assert_eq!(answer.header("cache-control"), "private, no-cache");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_token_begins_few_sessions_in_a_minute() {
+    let app = TestApp::start().await;
+    let [a, b] = ["a", "b"].map(|lab| app.token(&["create", "--lab", lab]));
+    let begin = |token: &str| app.request(Method::POST, "/view/session").bearer_auth(token);
+    let mut accepted = 0;
+    let refused = loop {
+        let answer = app.send(begin(&a)).await;
+        if answer.status != 201 {
+            break answer;
+        }
+        accepted += 1;
+        assert!(accepted < 100, "sessions are not limited");
+    };
+    assert!(accepted >= 20, "{accepted}");
+    let detail = refused.problem(429, "rate_limited");
+    assert!(detail.contains("sessions") && !refused.header("retry-after").is_empty(), "{detail}");
+    app.send(begin(&b)).await.expect(201);
+    app.send(app.request(Method::GET, "/v1/jobs").bearer_auth(&a)).await.expect(200);
 }
 
 #[tokio::test]

@@ -87,13 +87,24 @@ impl TestApp {
         Self::with(&["--workers", "0"]).await
     }
 
-    /// Starts a service with one worker that writes its full log to this file.
-    pub async fn logging(log: &Path) -> Self {
+    /// Starts a service that writes its log from this level on to this file.
+    pub async fn logging(log: &Path, level: &str, arguments: &[&str]) -> Self {
         let log = std::fs::File::create(log).unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let environment = [("RUST_LOG", "trace")];
-        let spawned = spawn(folder.path(), &owned(&["--workers", "1"]), &environment, log.into());
-        Self::from_process(folder, "", &["--workers", "1"], spawned.expect("the server starts"))
+        let environment = [("RUST_LOG", level)];
+        let spawned = spawn(folder.path(), &owned(arguments), &environment, log.into());
+        Self::from_process(folder, "", arguments, spawned.expect("the server starts"))
+    }
+
+    /// Starts a service without workers that may open this many files.
+    pub async fn with_few_files(files: u32, arguments: &[&str]) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut limited = Command::new("sh");
+        let script = format!("ulimit -n {files} && exec \"$0\" \"$@\"");
+        limited.arg("-c").arg(script).arg(env!("CARGO_BIN_EXE_sci-recon"));
+        let arguments = [&["--workers", "0"], arguments].concat();
+        let spawned = spawn_as(limited, folder.path(), &owned(&arguments), &[], Stdio::inherit());
+        Self::from_process(folder, "", &arguments, spawned.expect("the server starts"))
     }
 
     pub async fn with(arguments: &[&str]) -> Self {
@@ -391,7 +402,19 @@ fn spawn(
     environment: &[(&str, &str)],
     log: Stdio,
 ) -> Option<(Child, String)> {
-    let mut process = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+    let program = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    spawn_as(program, data, arguments, environment, log)
+}
+
+/// [`spawn`] with a command that starts the program.
+fn spawn_as(
+    mut program: Command,
+    data: &Path,
+    arguments: &[String],
+    environment: &[(&str, &str)],
+    log: Stdio,
+) -> Option<(Child, String)> {
+    let mut process = program
         .args(["serve", "--listen", "127.0.0.1:0", "--min-free-bytes", "1000000", "--data"])
         .arg(data)
         .args(arguments)

@@ -41,12 +41,14 @@ fn a_network_can_neither_reach_other_processes_nor_outlive_its_own() {
         assert!(lines.len() >= 20, "{text}\n{}", String::from_utf8_lossy(&output.stderr));
         lines
     };
-    for (name, done) in attempts(&[]) {
+    for (name, done) in attempts(&["--memory-bytes", "536870912"]) {
         assert_eq!(done, name.starts_with("need_"), "{name}");
     }
     // Without the confinement the same attempts succeed, so that the test can fail.
     let free = attempts(&["--unconfined"]);
-    for name in ["tgkill", "fork", "mmap_shared", "memfd_create", "setpriority"] {
+    let names = ["tgkill", "fork", "mmap_shared", "memfd_create", "setpriority"];
+    let memory = ["memory_over_limit", "memory_by_mprotect", "memory_by_brk"];
+    for name in names.into_iter().chain(memory) {
         assert!(free.contains(&(name.to_owned(), true)), "{name}: {free:?}");
     }
 }

@@ -269,3 +269,65 @@ async fn listeners_leave_places_for_other_labs_and_end_with_their_token() {
     let more = tokio::time::timeout(Duration::from_secs(1), others.chunk()).await;
     assert!(more.is_err(), "the streams of another token continue");
 }
+
+/// True if the service answers on this connection.
+async fn answers(socket: &mut TcpStream, address: &str) -> bool {
+    let request = format!("GET /livez HTTP/1.1\r\nHost: {address}\r\n\r\n");
+    let mut head = [0; 12];
+    let exchanged = async {
+        socket.write_all(request.as_bytes()).await?;
+        socket.read_exact(&mut head).await
+    };
+    let exchanged = tokio::time::timeout(Duration::from_secs(10), exchanged).await.unwrap();
+    exchanged.is_ok() && head.starts_with(b"HTTP/1.1 200")
+}
+
+/// 44 of 300 files are for connections.
+#[tokio::test]
+async fn one_address_has_at_most_half_of_the_connections() {
+    let app = TestApp::with_few_files(300, &[]).await;
+    let mut open = Vec::new();
+    for _ in 0..44 {
+        let mut socket = TcpStream::connect(app.address()).await.unwrap();
+        if answers(&mut socket, &app.address()).await {
+            open.push(socket);
+        }
+    }
+    assert_eq!(open.len(), 22, "half of the connections");
+    let port = app.address().rsplit(':').next().unwrap().parse().unwrap();
+    let other = tokio::net::TcpSocket::new_v4().unwrap();
+    other.bind("127.0.0.2:0".parse().unwrap()).unwrap();
+    let mut other =
+        other.connect(std::net::SocketAddr::from(([127, 0, 0, 1], port))).await.unwrap();
+    assert!(answers(&mut other, &app.address()).await, "another address gets a connection");
+    open.pop();
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let mut again = TcpStream::connect(app.address()).await.unwrap();
+    assert!(answers(&mut again, &app.address()).await);
+}
+
+#[tokio::test]
+async fn behind_a_trusted_proxy_the_limit_holds_for_each_client() {
+    let app = TestApp::with_few_files(300, &["--trusted-proxies", "127.0.0.0/8"]).await;
+    let listen = |client: &str| {
+        // A client can send an address of its choice; the proxy appends the true one.
+        let forwarded = format!("198.51.100.1, {client}");
+        app.request(Method::GET, "/v1/events").header("x-forwarded-for", forwarded)
+    };
+    let mut listening = Vec::new();
+    for _ in 0..22 {
+        let events = listen("192.0.2.1").send().await.unwrap();
+        assert_eq!(events.status(), 200);
+        listening.push(events);
+    }
+    let refused = Answer::read(listen("192.0.2.1").send().await.unwrap()).await;
+    let detail = refused.problem(429, "rate_limited");
+    assert!(detail.contains("192.0.2.1 has 22 requests in progress"), "{detail}");
+    assert_eq!(listen("192.0.2.2").send().await.unwrap().status(), 200);
+    drop(listening);
+    let start = Instant::now();
+    while listen("192.0.2.1").send().await.unwrap().status() != 200 {
+        assert!(start.elapsed().as_secs() < 10, "the places are not freed");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}

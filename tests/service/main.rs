@@ -8,6 +8,7 @@ mod all_labs;
 mod api;
 mod app;
 mod assessment;
+mod audit;
 mod calibration;
 mod checks;
 mod cli;

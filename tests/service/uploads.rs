@@ -36,6 +36,12 @@ async fn a_bad_upload_is_rejected_with_the_reason_and_leaves_no_file() {
     let put = |body: &'static str| app.request(Method::PUT, &format!("/v1/blobs/{ABC}")).body(body);
     let detail = app.send(put("abd")).await.problem(422, "hash_mismatch");
     assert!(detail.contains(ABC), "{detail}");
+    // A part of a file must not be stored as a file.
+    let part = |request: reqwest::RequestBuilder| request.header("content-range", "bytes 0-2/9");
+    for request in [put("abc"), app.request(Method::POST, "/v1/blobs").body("abc")] {
+        let detail = app.send(part(request)).await.problem(400, "malformed_request");
+        assert!(detail.contains("/v1/uploads"), "{detail}");
+    }
     app.send(put("")).await.problem(400, "empty_body");
     let post = |body: Body| app.request(Method::POST, "/v1/blobs").body(body);
     app.send(post(Body::from(""))).await.problem(400, "empty_body");

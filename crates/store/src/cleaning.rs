@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::error::{Result, StoreError};
+use super::rows::Expired;
 use super::{DataDir, Store, dir, on_files, upgrade};
 use crate::columns::{sql, sql_as};
 use engine::job::{JobId, PartialId, Sha256, Timestamp};
@@ -113,24 +114,28 @@ impl Store {
         Ok(blobs.chain(jobs).chain(partials).collect())
     }
 
-    /// Deletes jobs that ended before `before`, oldest first, until so many bytes of the disk are
-    /// free. Says how many.
-    pub async fn remove_jobs(&self, before: Timestamp, until_free: u64) -> Result<usize> {
-        let ended = sql_as!(
+    /// Deletes jobs that ended before `before`, oldest first, until `until_free` bytes of the disk are free. Calls `removed`
+    /// for each.
+    pub async fn remove_jobs(
+        &self,
+        before: Timestamp,
+        until_free: u64,
+        mut removed: impl FnMut(Expired<JobId>),
+    ) -> Result<()> {
+        let ended: Vec<Expired<JobId>> = sql_as!(
             // A job that has not ended has no time at which it did.
-            "SELECT id FROM jobs WHERE finished_at < ? ORDER BY finished_at, id",
+            "SELECT lab, id FROM jobs WHERE finished_at < ? ORDER BY finished_at, id",
             [before]
         )
         .fetch_all(&self.readers)
         .await?;
-        let mut removed = 0;
-        for id in ended {
+        for job in ended {
             if self.dir().disk()?.0 >= until_free {
                 break;
             }
-            match self.remove_job(id).await {
+            match self.remove_job(job.id).await {
                 Ok(()) => {
-                    removed += 1;
+                    removed(job);
                     // Before the disk is asked again.
                     self.removals.finished().await;
                 }
@@ -139,7 +144,7 @@ impl Store {
                 Err(error) => return Err(error),
             }
         }
-        Ok(removed)
+        Ok(())
     }
 }
 

@@ -60,7 +60,7 @@ pub use queue::{
     MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
     WorkerEnd,
 };
-pub use rows::{Filter, Page, Span};
+pub use rows::{Expired, Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{

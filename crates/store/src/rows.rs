@@ -1,10 +1,11 @@
 //! Statements, pages, and what rows refer to.
 
 use sqlx::SqliteConnection;
+use sqlx::sqlite::SqliteRow;
 
 use super::error::{Result, StoreError};
-use crate::columns::{sql, sql_as};
-use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256, ThingId, Timestamp};
+use crate::columns::{Columns, FromColumn, FromRow, sql, sql_as};
+use engine::job::{CalibrationId, Lab, MeasurementId, ModelId, Sha256, ThingId, Timestamp};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -21,6 +22,19 @@ impl<T> Page<T> {
         let more = items.len() > limit;
         items.truncate(limit);
         Self { items, more }
+    }
+}
+
+/// A resource that the service deleted because its time was over.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Expired<Id> {
+    pub lab: Lab,
+    pub id: Id,
+}
+
+impl<Id: FromColumn> FromRow for Expired<Id> {
+    fn from_row(row: &SqliteRow) -> Result<Self> {
+        Ok(Self { lab: row.read("lab")?, id: row.read("id")? })
     }
 }
 

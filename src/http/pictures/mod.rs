@@ -148,9 +148,8 @@ async fn draw(
 ) -> Result<Response> {
     let content = format!("picture/1 {} {region:?} {window:?}", picture.identity);
     let etag = conditional::etag(&Sha256::of(content.as_bytes()));
-    // What is done stays the same under this address for ever; private, as results are.
-    let keep = if picture.settled { "private, max-age=86400, immutable" } else { "no-cache" };
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, keep.to_owned())];
+    // The browser asks again before it shows a picture, so that it shows none after the end of a session.
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "private, no-cache".into())];
     conditional::check_match(headers, &etag)?;
     if conditional::is_known(headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, tags).into_response());

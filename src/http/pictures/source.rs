@@ -128,10 +128,6 @@ impl Stack {
         }
     }
 
-    fn settled(&self) -> bool {
-        !matches!(self.files, Files::Tiles(_))
-    }
-
     /// A picture of values that `read` computes from `depth` frames.
     fn picture<F>(&self, name: &str, depth: usize, read: F) -> Picture
     where
@@ -146,7 +142,6 @@ impl Stack {
             height,
             width,
             identity: format!("{} {name}", self.identity),
-            settled: self.settled(),
             channels: self.channels(),
             depth: depth * self.channels().count(),
             white: None,
@@ -240,7 +235,6 @@ pub(super) fn uploaded_frame(
         height: info.height,
         width: info.width,
         identity: format!("{sha256} sent {frame}"),
-        settled: true,
         channels: Channels::Grey,
         depth: 1,
         white: None,
@@ -267,7 +261,6 @@ pub(super) fn expected_error(
         height,
         width,
         identity: format!("{sha256} error {k}"),
-        settled: true,
         channels: Channels::Grey,
         depth: 1,
         white: None,
@@ -473,7 +466,6 @@ mod tests {
             }];
             let unfinished = Unfinished { preview: preview.clone(), tiles };
             let picture = stack((2, 40, 40), Files::Tiles(Arc::new(unfinished))).frame(1);
-            assert!(!picture.settled);
             let values = picture.reduce(&picture.whole(0)).unwrap();
             for ((i, j), &value) in values.indexed_iter() {
                 let expected = (i >= 16 && j >= 20).then_some(x[[1, i, j]]).or(below(i, j));

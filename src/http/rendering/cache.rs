@@ -104,7 +104,6 @@ mod tests {
             height: 1024,
             width: 1024,
             identity: name.to_string(),
-            settled: true,
             channels: Channels::Grey,
             depth: 1,
             white: None,

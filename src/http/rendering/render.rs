@@ -20,8 +20,6 @@ pub(in crate::http) struct Picture {
     pub(in crate::http) width: usize,
     /// Identifies the values: pictures with the same identity have the same values.
     pub(in crate::http) identity: String,
-    /// False while parts of the picture are still being computed.
-    pub(in crate::http) settled: bool,
     pub(in crate::http) channels: Channels,
     /// Samples that are read for each pixel.
     pub(in crate::http) depth: usize,
@@ -154,7 +152,6 @@ mod tests {
             height,
             width,
             identity: "test".into(),
-            settled: true,
             depth,
             white: None,
             read: Box::new(move |rows, columns| Ok(values.slice(s![rows, columns]).to_owned())),

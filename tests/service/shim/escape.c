@@ -40,6 +40,15 @@ __attribute__((constructor)) static void escape(void) {
     struct io_uring_params ring;
     memset(&ring, 0, sizeof ring);
 
+    /* More memory than the limit of 512 MiB, before an attempt lowers the limit. */
+    const size_t gib = 1UL << 30;
+    const int flags = MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE;
+    void *large = mmap(NULL, gib, PROT_READ | PROT_WRITE, flags, -1, 0);
+    report("memory_over_limit", large == MAP_FAILED ? -1 : 0);
+    void *hidden = mmap(NULL, gib, PROT_NONE, flags, -1, 0);
+    report("memory_by_mprotect",
+           hidden == MAP_FAILED ? -1 : mprotect(hidden, gib, PROT_READ | PROT_WRITE));
+    report("memory_by_brk", sbrk(gib) == (void *)-1 ? -1 : 0);
     report("kill", kill(other, 0));
     report("tkill", syscall(SYS_tkill, other, 0));
     report("tgkill", syscall(SYS_tgkill, other, other, 0));

@@ -6,7 +6,7 @@ use strum::Display;
 
 use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::Page;
+use crate::rows::{Expired, Page};
 use crate::staging::StagedBlob;
 use crate::tables::quota;
 use crate::{Store, deletion, on_files};
@@ -206,17 +206,21 @@ impl Store {
     }
 
     /// Removes the uploads that nothing refers to and nobody has sent since `before`, and requests from before that
-    /// were refused. Returns the number of uploads.
-    pub async fn collect(&self, before: Timestamp) -> Result<usize> {
+    /// were refused. Returns the labs' uploads; arrays that were prepared from uploads go as well.
+    pub async fn collect(&self, before: Timestamp) -> Result<Vec<Expired<Sha256>>> {
         let mut transaction = self.write().await?;
         sql!("DELETE FROM requests WHERE refusal IS NOT NULL AND created_at < ?", [before])
             .execute(&mut *transaction)
             .await?;
-        sql!(
-            concat!("DELETE FROM holdings AS h WHERE touched_at < ? AND NOT ", in_use!()),
+        let uploads = sql_as!(
+            concat!(
+                "DELETE FROM holdings AS h WHERE touched_at < ? AND NOT ",
+                in_use!(),
+                " RETURNING lab, sha256 AS id"
+            ),
             [before]
         )
-        .execute(&mut *transaction)
+        .fetch_all(&mut *transaction)
         .await?;
         let removed = sql_as!(
             "DELETE FROM blobs WHERE touched_at < ?
@@ -234,7 +238,7 @@ impl Store {
             deletion::note_blob(&mut transaction, *sha256, *created_at).await?;
         }
         self.commit_removals(transaction).await?;
-        Ok(removed.len())
+        Ok(uploads)
     }
 
     /// Number and bytes of all stored files.

@@ -9,7 +9,7 @@ use std::time::Duration;
 use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::locked::LockedFile;
-use crate::rows::Page;
+use crate::rows::{Expired, Page};
 use crate::tables::keys::{self, Inserted, Made, RequestKey};
 use crate::tables::quota;
 use crate::{Store, dir, on_files};
@@ -330,17 +330,22 @@ impl Store {
     }
 
     /// Ends the uploads that have expired, but none to which a piece is being written, nor one that only a clock
-    /// that was wrong made old. Says how many. `age` is how long an upload is kept after its last piece.
-    pub async fn expire_partials(&self, age: Duration) -> Result<usize> {
+    /// that was wrong made old. Calls `ended` for each. `age` is how long an upload is kept after its last piece.
+    pub async fn expire_partials(
+        &self,
+        age: Duration,
+        mut ended: impl FnMut(Expired<PartialId>),
+    ) -> Result<()> {
         let empty = age.min(EMPTY);
         // What ends now began its age so long ago.
         let (last_empty, last) = (self.ago(empty).await?, self.ago(age).await?);
         let due = sql_as!(
-            "SELECT id FROM partials WHERE expires_at <= iif(received = 0, ?, ?)",
+            "SELECT lab, id FROM partials WHERE expires_at <= iif(received = 0, ?, ?)",
             [later(last_empty, empty), later(last, age)]
         );
-        let mut ended = 0;
-        for id in due.fetch_all(&self.readers).await? {
+        let due: Vec<Expired<PartialId>> = due.fetch_all(&self.readers).await?;
+        for upload in due {
+            let id = upload.id;
             let path = self.dir().partial(id);
             let lock = on_files(move || lock(&path)).await?;
             // A piece may have come before the lock was taken.
@@ -353,10 +358,10 @@ impl Store {
             .is_some();
             if is_due && !matches!(lock, Lock::Busy) {
                 self.end_partial(id).await?;
-                ended += 1;
+                ended(upload);
             }
         }
-        Ok(ended)
+        Ok(())
     }
 }
 

@@ -60,13 +60,13 @@ async fn used_things_are_kept_and_unused_ones_collected() {
         lab.store.delete_measurement(&engine::job::Lab::local(), lab.measurement).await
     ));
     let soon = Timestamp(Timestamp::now().0 + 1000);
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 0);
+    assert_eq!(lab.store.collect(soon).await.unwrap().len(), 0);
     lab.store.cancel_job(&engine::job::Lab::local(), job).await.unwrap();
     lab.store.delete_job(&engine::job::Lab::local(), job).await.unwrap();
     lab.store.delete_measurement(&engine::job::Lab::local(), lab.measurement).await.unwrap();
     lab.store.delete_calibration(&engine::job::Lab::local(), calibration).await.unwrap();
     assert_eq!(lab.store.blob_totals().await.unwrap().0, 2, "uploads wait for their age");
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 2);
+    assert_eq!(lab.store.collect(soon).await.unwrap().len(), 2);
     let left = walk(&lab.store.dir().blobs());
     assert_eq!(left, Vec::<std::path::PathBuf>::new());
 }
@@ -92,12 +92,12 @@ async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
     let model = lab.store.model(&local, id).await.unwrap();
     lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
     let soon = Timestamp(Timestamp::now().0 + 1000);
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the data of the measurement");
+    assert_eq!(lab.store.collect(soon).await.unwrap().len(), 1, "the data of the measurement");
     assert!(lab.store.upload(&local, file.sha256).await.is_ok());
     let refused = lab.store.delete_calibration(&local, calibration).await;
     assert!(matches!(refused, Err(StoreError::InUse { by: "models", users: 1, .. })));
     lab.store.delete_model(&local, model.id).await.unwrap();
-    assert_eq!(lab.store.collect(soon).await.unwrap(), 1, "the network");
+    assert_eq!(lab.store.collect(soon).await.unwrap().len(), 1, "the network");
     lab.store.delete_calibration(&local, calibration).await.unwrap();
 }
 

@@ -1,0 +1,73 @@
+//! Records the changes that commands make on the machine of the service.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::CliError;
+use crate::audit::{Actor, AuditLog, Entry, Outcome};
+use crate::cli::error::Result;
+use crate::config::AuditArguments;
+use engine::job::Lab;
+
+/// A change that a command makes.
+#[derive(Debug)]
+pub(super) struct Change {
+    /// The command.
+    pub action: &'static str,
+    pub lab: Option<Lab>,
+    /// The identifier of the changed resource.
+    pub object: String,
+}
+
+/// The part of `server.json` that is read here.
+#[derive(Deserialize)]
+struct Announcement {
+    audit_log: Option<PathBuf>,
+}
+
+/// The audit log with the given file, or else with that of the service that runs on the data folder.
+/// Errors: the file can't be written.
+pub(super) fn audit_log(arguments: &AuditArguments, data: &Path) -> Result<AuditLog> {
+    let announced = || {
+        let text = std::fs::read(data.join("server.json")).ok()?;
+        serde_json::from_slice::<Announcement>(&text).ok()?.audit_log
+    };
+    let Some(file) = arguments.audit_log.clone().or_else(announced) else {
+        return Ok(AuditLog::default());
+    };
+    AuditLog::open(Some(&file)).map_err(|error| {
+        let path = file.display();
+        CliError::Input(format!(
+            "the audit log {path} can't be written: {error}; nothing was changed. Run the command as the user of the \
+            service, or name another file with --audit-log"
+        ))
+    })
+}
+
+/// Makes a change, and records it with its outcome.
+pub(super) async fn audited<T>(
+    log: &AuditLog,
+    change: Change,
+    act: impl Future<Output = Result<T>>,
+) -> Result<T> {
+    let Change { action, lab, object } = change;
+    let result = act.await;
+    let outcome = match &result {
+        Ok(_) => Outcome::Done,
+        Err(CliError::Input(_)) => Outcome::Refused,
+        Err(_) => Outcome::Failed,
+    };
+    let entry = Entry::new(Actor::Command, action, outcome);
+    log.record(&Entry { lab, object: Some(object), user: Some(user()), ..entry });
+    result
+}
+
+/// The user of this process, and the user behind `sudo`.
+fn user() -> String {
+    let uid = rustix::process::getuid().as_raw();
+    match std::env::var("SUDO_USER") {
+        Ok(name) => format!("uid {uid}, sudo by {name}"),
+        Err(_) => format!("uid {uid}"),
+    }
+}
