@@ -165,13 +165,13 @@ eval-loop: evaluation-data $(TRAINING)/.stamp runtime ## evaluate each network i
 		--data $(DATA) --scenes $(SCENES) --white $(WHITE) $(if $(MODELS),--models $(MODELS)) \
 		$(if $(FULL),--full) $(if $(PREDICTIONS),--predictions) $(if $(CACHED),--cached) $(if $(FRESH),--fresh) $(if $(JSON),--json)
 
-eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## test which wrong inputs are flagged, and which correct ones; ALGORITHM=gap-tv GOOD=60 WRONG=6
+eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## test whether the first finding names the cause of wrong inputs, and false alarms; ALGORITHM=gap-tv GOOD=60 WRONG=20
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
-		$(TRAINING)/bin/python research/assessment/wrong_inputs.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
-		--data $(DATA) --algorithm $(ALGORITHM) --good $(GOOD) --scenes $(WRONG)
+		$(TRAINING)/bin/python research/assessment/wrong_inputs.py run $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		--data $(DATA) --out eval-output/wrong-inputs --algorithm $(ALGORITHM) --good $(GOOD) --scenes $(WRONG)
 GOOD ?= 60
-WRONG ?= 6
+WRONG ?= 20
 
 evaluation-data:
 	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \

@@ -1,39 +1,46 @@
-"""Test whether wrong inputs are flagged, and correct ones are not, through the real service.
+"""Test whether wrong inputs are flagged by a finding that names their cause, and whether right ones are not.
 
-    python wrong_inputs.py SCI_RECON_BINARY --data DATA [--good 60] [--scenes 6] [--algorithm gap-tv] [--side 256]
+    python wrong_inputs.py run SCI_RECON_BINARY --data DATA --out FOLDER [--scenes 20] [--good 60] [--kinds TEXT...]
+    python wrong_inputs.py report --out FOLDER [--markdown] [--write ../../docs/DATA.md]
 
 DATA has photographs in photos/train and photos/val. A camera moves over them by at most 4 pixels per frame, behind
-masks of every kind, Cr 6 to 24, with noise of 0 to 10 and given dark frames. A result is flagged if its assessment has
-a finding about the input, is graded `bad` though its PSNR is above 22 dB, or is predicted 3 dB below that of the
-correct input. The last line of the output is JSON.
+masks of every kind, Cr 6 to 24, with noise of 0 to 10 and given dark frames. `run` gives each kind of input of each
+scene to `sci-recon reconstruct`, which runs the checks of the service, and appends the results to a file in FOLDER for
+this binary: an interrupted run continues where it stopped. `report` reads the newest file. It counts, for each kind,
+how many inputs are flagged at all, and for how many the first finding names the cause. The last line of a report is
+JSON.
 """
 import argparse
+import concurrent.futures
+import dataclasses
 import glob
+import hashlib
 import json
+import os
 import pathlib
-import shutil
+import re
 import subprocess
 import sys
 import tempfile
+import threading
 
 import cv2
 import numpy as np
 
-HERE = pathlib.Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent.parent / 'benches' / 'scale'))
-from service import Service  # noqa: E402
-
 PATTERNS = 'iid', 'random-squares', 'rotating-circle'
 RATIOS = 6, 8, 10, 12, 16, 20, 24
 SIGMAS = 0, 0, 0, 2, 5, 10
+STEPS = 0, .3, 1, 2, 4
 # Offset that the camera adds, as a share of the mean, and the brightest pixel as a share of the largest number.
 DARK, HEADROOM = .1, .8
-# Findings about the scene, not about wrong inputs.
-SCENE_FINDINGS = {'uneven_error'}
-FALL = 3.0      # dB
+SIXTEEN = 65535
+LOSS = 3.0      # dB that a harmful input costs
+SEEN = .5       # dB that a wrong order costs where the scene shows it
 BAD = 22.0      # dB, as in the program
+UNEVEN = 1.0    # dB that a part is worse, if `uneven_error` is right
 
 
+# ---------------------------------------------------------------- scenes
 def panned(photo, frames, side, step, scale):
     """Frames [frames,side,side] on [0,1] of a camera that moves by `step` pixels per frame over a grey photograph."""
     scale = max(scale, (side + 2) / min(photo.shape))
@@ -43,121 +50,468 @@ def panned(photo, frames, side, step, scale):
     return np.stack([cv2.warpAffine(photo, matrix(k), (side, side), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT) for k in range(frames)]).clip(0, 1)
 
 
-class Lab:
-    def __init__(self, service, folder, algorithm):
-        self.service, self.folder, self.algorithm = service, folder, algorithm
+class Scene:
+    """A scene, its masks and its snapshot. `variant` is '', or 'steady' or 'static' for independent masks and a motion
+    of 1.5 or 0 pixels per frame."""
 
-    def send(self, array):
-        np.save(self.folder / 'one.npy', array)
-        return self.service.upload(self.folder / 'one.npy')
+    def __init__(self, binary, files, index, variant, side):
+        self.name, self.index, self.rng = f'{index}{variant}', index, np.random.default_rng([3, index])
+        file, rng = files[index % len(files)], self.rng
+        photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE)
+        ratio, self.pattern, self.sigma = int(rng.choice(RATIOS)), PATTERNS[index % 3], float(rng.choice(SIGMAS))
+        step, scale = float(rng.choice(STEPS)), float(rng.choice([.3, .5, .8]))
+        if variant:
+            self.pattern, step, ratio = 'iid', {'steady': 1.5, 'static': 0}[variant], min(ratio, 10)
+        self.photo, self.step = pathlib.Path(file).stem, step
+        frames = panned(photo, ratio, side, step, scale)
+        with tempfile.TemporaryDirectory() as folder:
+            folder = pathlib.Path(folder)
+            np.save(folder / 'scene.npy', frames.astype(np.float32))
+            for seed, name in ((1, 'one'), (2, 'other')):
+                subprocess.run([binary, 'simulate', '--frames', folder / 'scene.npy', '--compression-ratio', str(ratio), '--pattern', self.pattern,
+                                '--noise-sigma', str(self.sigma), '--seed', str(seed), '--out', folder / name], check=True, stdout=subprocess.DEVNULL)
+            self.masks, self.other = (np.load(folder / name / 'masks.npy') for name in ('one', 'other'))
+            self.clean, self.truth = np.load(folder / 'one/measurement.npy').reshape(side, side), np.load(folder / 'one/truth.npy')
+        moved = panned(photo, ratio, side, 10, scale)
+        self.noise = self.clean - self.light(self.truth)
+        self.fast, self.fast_truth = self.light(moved) + self.noise, moved
+        self.dark = np.float32(DARK * self.clean.mean()) * (1 + .1 * rng.standard_normal(self.clean.shape, np.float32))
 
-    def job(self, masks, y, dark=None, full=65535 * HEADROOM, stated=1):
-        """Assessment and frames of a job with 16-bit numbers, where `full` stands for the largest value of `y`, and the
-        stated full scale is `stated` times the true one."""
-        scale = full / y.max()
-        counts = lambda values: self.send((values * scale).round().clip(0, 65535).astype(np.uint16))
-        calibration = self.service.call('POST', '/v1/calibrations', {'masks': self.send(masks.astype(np.float32))})['id']
-        body = {'calibration': calibration, 'data': counts(y), 'full_scale': float(scale * stated)} | ({'dark': [counts(dark)]} if dark is not None else {})
-        measurement = self.service.call('POST', '/v1/measurements', body)['id']
-        job = self.service.call('POST', '/v1/jobs', {'measurement': measurement, 'algorithm': self.algorithm})['id']
-        while True:
-            ended = self.service.call('GET', f'/v1/jobs/{job}?wait=20')
-            if ended['state'] not in ('queued', 'running'):
-                break
-        if ended['state'] != 'succeeded':
-            sys.exit(f'a job ended as {ended["state"]}: {ended}')
-        return ended['assessment'], self.service.array(f'/v1/jobs/{job}/snapshots/0/frames.npy', self.folder / 'frames.npy')
+    def light(self, frames):
+        return (self.masks * frames).sum(0)
 
-
-def wrongs(masks, other, clean, dark, fast):
-    """Name and job arguments of each wrong input; `fast` is the measurement of a fast motion."""
-    gains = np.tile([[.7, 1.], [1., .8]], [extent // 2 for extent in clean.shape])
-    y = clean + dark
-    yield 'foreign masks', dict(masks=other, y=y, dark=dark)
-    yield 'masks shifted by 2 pixels', dict(masks=np.roll(masks, 2, axis=2), y=y, dark=dark)
-    yield '1 % saturated', dict(masks=masks, y=y, dark=dark, full=65535 * y.max() / np.quantile(y, .99))
-    yield 'no dark', dict(masks=masks, y=y)
-    yield 'a dark of another exposure', dict(masks=masks, y=y, dark=3 * dark)
-    yield 'full scale wrong by ten', dict(masks=masks, y=y, dark=dark, stated=10)
-    yield 'full scale wrong by a tenth', dict(masks=masks, y=y, dark=dark, stated=.1)
-    yield 'a Bayer mosaic taken as grey', dict(masks=masks, y=clean * gains + dark, dark=dark)
-    yield 'motion above 8 pixels a frame', dict(masks=masks, y=fast + dark, dark=dark)
+    def describe(self):
+        return f'{self.photo[:30]} {self.pattern} Cr {len(self.masks)} sigma {self.sigma:g} step {self.step:g}'
 
 
-def psnr(found, truth):
-    """Relative to the white level of the frames, as the expected PSNR is."""
-    peak = np.quantile(found, .999)
-    return float(np.mean(-10 * np.log10(((found - truth) ** 2).mean((1, 2)) / peak ** 2)))
+@dataclasses.dataclass
+class Input:
+    """The files and options of a reconstruction. `y` and `dark` are light; a camera stores them with `scale` counts per
+    unit, up to `limit`; floats are cut at `cut`. The stated full scale is `stated` times the true one."""
+    masks: np.ndarray
+    y: np.ndarray
+    dark: np.ndarray = None
+    limit: int = SIXTEEN
+    scale: float = None
+    stated: float = 1
+    full: float = None          # the stated full scale itself
+    whole: bool = True          # the camera stores whole numbers
+    cut: float = np.inf
+    truth: np.ndarray = None
+    options: tuple = ()
+
+    def stored(self, values):
+        counts = values * self.counts()
+        kind = np.uint8 if self.limit == 255 else np.uint16
+        return counts.round().clip(0, self.limit).astype(kind) if self.whole else np.minimum(counts, self.cut).astype(np.float32)
+
+    def counts(self):
+        return self.scale if self.scale else HEADROOM * self.limit / np.nanmax(self.y)
 
 
-def shown(assessment):
-    return '    -' if assessment['psnr_db'] is None else f"{assessment['psnr_db']:5.1f}"
+# ---------------------------------------------------------------- kinds of inputs
+RIGHT, WRONG, HIDDEN = 'right', 'wrong', 'hidden'
 
 
-def flags(assessment, right=None, true=None):
-    """Reasons for which an assessment is a warning. The prediction counts only if that of the correct input is known."""
-    found = [reason['code'] for reason in assessment['reasons'] if reason['code'] not in SCENE_FINDINGS]
-    if right is not None and None not in (assessment['psnr_db'], right['psnr_db']) and assessment['psnr_db'] <= right['psnr_db'] - FALL:
-        found.append('prediction')
-    if assessment['grade'] == 'bad' and (true is None or true > BAD):
-        found.append('bad')
-    return found
+@dataclasses.dataclass
+class Kind:
+    """`causes` are codes of findings that name the cause, or `code: text` if the finding must contain a text, or
+    `refused: text` for an error. A hidden kind can't be seen in one snapshot."""
+    name: str
+    causes: tuple
+    make: callable
+    what: str = WRONG
+    variant: str = ''
+    masks: bool = False         # the masks are wrong
+    harmful: float = 0          # counts only where it costs this many dB
+
+
+def taken(scene, **changes):
+    """The right input of a 16-bit camera with a dark frame, with changes."""
+    return Input(**(dict(masks=scene.masks.astype(np.float32), y=scene.clean + scene.dark, dark=scene.dark, truth=scene.truth) | changes))
+
+
+def with_masks(masks):
+    return lambda scene: taken(scene, masks=np.ascontiguousarray(masks(scene)).astype(np.float32))
+
+
+def clipped(share, limit, whole=True):
+    def make(scene):
+        y = scene.clean + scene.dark
+        return taken(scene, limit=limit, scale=limit / np.quantile(y, 1 - share), whole=whole, cut=limit)
+    return make
+
+
+def with_pixels(change, whole=True):
+    """Changes the stored snapshot: `change(y, rng)` where the largest number is 1."""
+    def make(scene):
+        given = taken(scene, whole=whole)
+        y = given.y * given.counts() / given.limit
+        change(y, np.random.default_rng([4, scene.index]))
+        return dataclasses.replace(given, y=y * given.limit / given.counts(), scale=given.counts())
+    return make
+
+
+def scattered(value):
+    def change(y, rng):
+        y.flat[rng.choice(y.size, 20, replace=False)] = value if np.isscalar(value) else rng.uniform(*value, 20)
+    return change
+
+
+def lines(value):
+    def change(y, rng):
+        y[:, rng.integers(10, y.shape[1] - 10)] = value
+    return change
+
+
+def cluster(value):
+    def change(y, rng):
+        for _ in range(3):
+            row, column = rng.integers(5, y.shape[0] - 8, 2)
+            y[row:row + 3, column:column + 3] = value
+    return change
+
+
+def moved(masks, rows, columns):
+    """Masks that are displaced by a fraction of a pixel."""
+    matrix = np.float32([[1, 0, columns], [0, 1, rows]])
+    size = masks.shape[:0:-1]
+    return np.stack([cv2.warpAffine(mask.astype(np.float32), matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT) for mask in masks])
+
+
+def exchanged(scene):
+    masks, count = scene.masks.copy(), len(scene.masks)
+    first, second = count // 4, count - 1 - count // 4
+    masks[[first, second]] = masks[[second, first]]
+    return masks
+
+
+def shuffled(scene):
+    return scene.masks[np.random.default_rng([6, scene.index]).permutation(len(scene.masks))]
+
+
+def one_mask(value):
+    def masks(scene):
+        masks, k = scene.masks.copy(), len(scene.masks) // 2
+        masks[k] = masks[k - 1] if value is None else value
+        return masks
+    return masks
+
+
+def tinted(gains):
+    """A mosaic of RGGB behind a scene with a tint, or with complementary tints that change over the picture."""
+    def make(scene):
+        height, width = scene.clean.shape
+        rows, columns = np.mgrid[:height, :width]
+        if callable(gains):
+            red, blue = gains(rows / height, columns / width)
+        else:
+            red, blue = gains
+        gain = np.select([(rows % 2 == 0) & (columns % 2 == 0), (rows % 2 == 1) & (columns % 2 == 1)], [red * np.ones(rows.shape), blue * np.ones(rows.shape)], 1)
+        return taken(scene, y=scene.light(scene.truth) * gain + scene.noise + scene.dark)
+    return make
+
+
+def complementary(rows, columns):
+    hue = .4 * np.sin(2 * np.pi * rows) * np.cos(2 * np.pi * columns)
+    return 1 + hue, 1 - hue
+
+
+def halves(rows, columns):
+    left = columns < .5
+    return np.where(left, 1.35, .65), np.where(left, .65, 1.35)
+
+
+def noisy(scene):
+    noise = 50 / 255 * np.random.default_rng([7, scene.index]).standard_normal(scene.clean.shape)
+    return taken(scene, y=scene.clean + noise + scene.dark)
+
+
+def without_a_pattern(scene):
+    k = len(scene.masks) // 2
+    return taken(scene, y=scene.clean - scene.masks[k] * scene.truth[k] + scene.dark)
+
+
+def integers(most, kind):
+    return lambda scene: taken(scene, masks=(scene.masks * most).round().astype(kind))
+
+
+def right(scene, **changes):
+    return taken(scene, **changes)
+
+
+KINDS = [
+    Kind('right: 16-bit camera with a dark', (), right, RIGHT),
+    Kind('right: float files without an offset', (), lambda s: taken(s, y=s.clean, dark=None, limit=1, scale=1 / len(s.masks), whole=False), RIGHT),
+    Kind('right: 12-bit camera with a dark', (), lambda s: taken(s, limit=4095), RIGHT),
+    Kind('right: masks in uint8, 0 and 1 for binary ones', (), lambda s: integers(1 if s.pattern == 'iid' else 255, np.uint8)(s), RIGHT),
+    Kind('right: steady motion', (), right, RIGHT, 'steady'),
+    Kind('right: static scene', (), right, RIGHT, 'static'),
+    Kind('right: noise of sigma 50', (), noisy, RIGHT),
+
+    Kind('full scale of the measurement ten times too large', ('level',), lambda s: taken(s, stated=10)),
+    Kind('full scale of the measurement ten times too small', ('level',), lambda s: taken(s, stated=.1)),
+    Kind('full scale of the measurement three times too large', ('level',), lambda s: taken(s, stated=3), HIDDEN),
+    Kind('12 bits in 16, full scale 65535', ('right_aligned',), lambda s: taken(s, limit=4095, full=SIXTEEN)),
+    Kind('12-bit masks in uint16, full scale 65535', ('mask_scale',), integers(4095, np.uint16)),
+    Kind('4-bit masks in uint8, full scale 255', ('mask_scale',), integers(15, np.uint8)),
+    Kind('float masks divided by 255', ('mask_scale',), with_masks(lambda s: s.masks / 255)),
+    Kind('float masks from 0 to 255', ('refused: full',), with_masks(lambda s: s.masks * 255)),
+    Kind('masks of -1 and 1', ('refused: two exposures',), with_masks(lambda s: 2 * (s.masks > s.masks.mean()) - 1)),
+    Kind('no dark', ('no_dark',), lambda s: taken(s, dark=None)),
+    Kind('dark of three times the exposure', ('wrong_dark', 'negative'), lambda s: taken(s, dark=3 * s.dark)),
+    Kind('dark of half the exposure', ('wrong_dark',), lambda s: taken(s, dark=s.dark / 2)),
+    Kind('dark subtracted twice', ('wrong_dark', 'negative'), lambda s: taken(s, y=s.clean)),
+    Kind('too much subtracted before the upload', ('negative_offset', 'negative'), lambda s: taken(s, y=s.clean - s.dark, dark=None, limit=1, scale=1 / len(s.masks), whole=False)),
+    Kind('1 % saturated, 16 bits', ('saturated',), clipped(.01, SIXTEEN)),
+    Kind('3 % saturated, 8 bits', ('saturated',), clipped(.03, 255)),
+    Kind('13 % saturated, 12 bits', ('saturated',), clipped(.13, 4095)),
+    Kind('13 % saturated, 14 bits', ('saturated',), clipped(.13, 16383)),
+    Kind('13 % saturated, float', ('saturated',), clipped(.13, 1, False)),
+    Kind('30 % saturated, 12 bits', ('saturated',), clipped(.3, 4095)),
+    Kind('20 hot pixels at the largest number', ('bad_pixels', 'saturated'), with_pixels(scattered(1))),
+    Kind('20 hot pixels, each with another value', ('bad_pixels',), with_pixels(scattered((3, 9)), False)),
+    Kind('20 dead pixels', ('bad_pixels',), with_pixels(scattered(0))),
+    Kind('20 pixels of NaN', ('bad_pixels',), with_pixels(scattered(np.nan), False)),
+    Kind('a hot column', ('bad_pixels', 'saturated'), with_pixels(lines(1))),
+    Kind('a dead column', ('bad_pixels',), with_pixels(lines(0))),
+    Kind('clusters of 3x3 hot pixels', ('bad_pixels', 'saturated'), with_pixels(cluster(1))),
+    Kind('a snapshot of 0', ('refused: 0',), lambda s: taken(s, y=s.dark)),
+    Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
+
+    Kind('masks of another calibration', ('foreign_masks',), with_masks(lambda s: s.other), masks=True),
+    Kind('masks flipped from left to right', ('turned_masks',), with_masks(lambda s: s.masks[:, :, ::-1]), masks=True),
+    Kind('masks flipped upside down', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1]), masks=True),
+    Kind('masks turned by 180 degrees', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1, ::-1]), masks=True),
+    Kind('masks turned by 90 degrees', ('turned_masks',), with_masks(lambda s: np.rot90(s.masks, axes=(1, 2))), masks=True),
+    Kind('masks with rows and columns exchanged', ('turned_masks',), with_masks(lambda s: s.masks.transpose(0, 2, 1)), masks=True),
+    Kind('masks shifted by 1 pixel', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, 1, axis=1)), masks=True),
+    Kind('masks shifted by 2 pixels', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, 2, axis=2)), masks=True),
+    Kind('masks shifted by 3 rows and 4 columns', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, (3, -4), axis=(1, 2))), masks=True),
+    Kind('crop that begins 8 rows and 20 columns away', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, (-8, 20), axis=(1, 2))), masks=True),
+    Kind('drift by half a pixel', ('drifted_masks',), with_masks(lambda s: moved(s.masks, 0, .5)), masks=True),
+    Kind('drift by 0.35 rows and 0.35 columns', ('drifted_masks',), with_masks(lambda s: moved(s.masks, .35, .35)), masks=True),
+    Kind('one mask twice', ('bad_calibration: repeated_pattern',), with_masks(one_mask(None)), masks=True),
+    Kind('one mask black', ('refused: open pixels',), with_masks(one_mask(0)), masks=True),
+    Kind('a pattern that was not shown', ('missing_pattern',), without_a_pattern),
+    Kind('two masks exchanged, steady motion, independent masks', ('exchanged_masks',), with_masks(exchanged), variant='steady', masks=True, harmful=SEEN),
+    Kind('masks shuffled, steady motion, independent masks', ('exchanged_masks',), with_masks(shuffled), variant='steady', masks=True, harmful=SEEN),
+    Kind('two masks exchanged, any scene', ('exchanged_masks',), with_masks(exchanged), HIDDEN, masks=True),
+    Kind('two masks exchanged, static scene', ('exchanged_masks',), with_masks(exchanged), HIDDEN, 'static', masks=True),
+    Kind('masks in reverse order', ('exchanged_masks',), with_masks(lambda s: s.masks[::-1]), HIDDEN, 'steady', masks=True),
+    Kind('masks begin with the second', ('exchanged_masks',), with_masks(lambda s: np.roll(s.masks, -1, axis=0)), HIDDEN, 'steady', masks=True),
+    Kind('Bayer mosaic as grey, one tint', ('mosaic',), tinted((.7, .8))),
+    Kind('Bayer mosaic as grey, complementary tints', ('mosaic',), tinted(complementary)),
+    Kind('Bayer mosaic as grey, two halves of complementary tints', ('mosaic',), tinted(halves)),
+    Kind('motion of 10 pixels a frame', ('fast_motion',), lambda s: taken(s, y=s.fast + s.dark, truth=s.fast_truth), harmful=LOSS),
+]
+
+
+# ---------------------------------------------------------------- runs
+class Bench:
+    def __init__(self, a):
+        with open(a.binary, 'rb') as file:
+            name = hashlib.file_digest(file, 'sha256').hexdigest()[:12]
+        self.a, self.path, self.lock = a, pathlib.Path(a.out) / f'{name}.jsonl', threading.Lock()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.touch()
+        self.done = {(row['kind'], row['scene']) for row in read(a.out)}
+        files = sorted(glob.glob(f'{a.data}/photos/val/*.jpg') + glob.glob(f'{a.data}/photos/train/*.jpg'))
+        self.files = files or sys.exit(f'no photographs in {a.data}/photos')
+
+    def wanted(self, index, variant):
+        for kind in KINDS:
+            count = self.a.good if kind is KINDS[0] else self.a.scenes
+            chosen = not self.a.kinds or any(text in kind.name for text in self.a.kinds)
+            if kind.variant == variant and index < count and chosen and (kind.name, index) not in self.done:
+                yield kind
+
+    def scene(self, index):
+        for variant in ('', 'steady', 'static'):
+            kinds = list(self.wanted(index, variant))
+            if not kinds:
+                continue
+            scene = Scene(self.a.binary, self.files, index, variant, self.a.side)
+            for kind in kinds:
+                row = {'kind': kind.name, 'scene': index, 'about': scene.describe()} | self.reconstruct(kind.make(scene))
+                with self.lock, open(self.path, 'a') as file:
+                    file.write(json.dumps(row) + '\n')
+
+    def reconstruct(self, given):
+        with tempfile.TemporaryDirectory() as folder:
+            folder = pathlib.Path(folder)
+            arrays = {'masks': given.masks, 'measurement': given.stored(given.y), 'truth': given.truth.astype(np.float32)}
+            options = []
+            if given.dark is not None:
+                arrays['dark'] = given.stored(given.dark)
+                options = ['--dark', folder / 'dark.npy']
+            for name, array in arrays.items():
+                np.save(folder / f'{name}.npy', array)
+            command = [self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
+                       '--truth-full-scale', '1', '--measurement-full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
+                       '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
+            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            if done.returncode == 2:
+                return {'refused': done.stderr.strip()}
+            if done.returncode not in (0, 3):
+                sys.exit(f'a reconstruction failed: {done.stderr}')
+            report = json.loads(done.stdout)
+            errors = ((np.load(folder / 'out/frames.npy') - given.truth) ** 2).mean(0)
+        assessment = report['assessment'] or {}
+        return {'findings': [[one['code'], one['detail']] for one in report['findings']], 'grade': assessment.get('grade'), 'order': assessment.get('order'),
+                'expected_db': assessment.get('psnr_db'), 'true_db': report['psnr_db'], 'unit_db': report['psnr_unit_db'], 'parts_db': parts(errors)}
+
+
+def parts(errors):
+    """PSNR of each ninth of the picture, less that of the whole picture."""
+    height, width = errors.shape
+    thirds = lambda length: [0, length // 3, length - length // 3, length]
+    rows, columns = thirds(height), thirds(width)
+    relative = lambda part: round(-10 * float(np.log10(part.mean() / errors.mean())), 2)
+    return [[relative(errors[rows[i]:rows[i + 1], columns[j]:columns[j + 1]]) for j in range(3)] for i in range(3)]
+
+
+def read(folder):
+    """The rows of the binary that was run last."""
+    files = sorted(pathlib.Path(folder).glob('*.jsonl'), key=os.path.getmtime)
+    return [json.loads(line) for line in files[-1].read_text().splitlines()] if files else []
+
+
+def run(a):
+    bench = Bench(a)
+    with concurrent.futures.ThreadPoolExecutor(a.parallel) as pool:
+        for future in [pool.submit(bench.scene, index) for index in range(max(a.scenes, a.good))]:
+            future.result()
+    report(a)
+
+
+# ---------------------------------------------------------------- report
+PARTS = [f'{row}{column}' for row in ('top ', '', 'bottom ') for column in ('left', 'centre', 'right')]
+
+
+def is_right_about_part(row, detail):
+    """True if the part that `uneven_error` names is worse than the picture."""
+    named = re.match(r'the (top |bottom |)(left|centre|right) ', detail)
+    part = PARTS.index(named[1] + named[2])
+    return row['parts_db'][part // 3][part % 3] < -UNEVEN
+
+
+def alarms(row):
+    """The findings that doubt an input. `uneven_error` counts where the part is no worse than the picture."""
+    if 'refused' in row:
+        return ['refused']
+    return [code for code, detail in row['findings'] if code != 'uneven_error' or not is_right_about_part(row, detail)]
+
+
+def is_too_low(row):
+    """True if a result is graded `bad` though it is not."""
+    return row.get('grade') == 'bad' and row['true_db'] > BAD
+
+
+def names_cause(row, causes):
+    """True if the first finding names one of the causes."""
+    if 'refused' in row:
+        return any(cause.startswith('refused') and cause.split(': ')[1] in row['refused'] for cause in causes)
+    findings = [one for one in row['findings'] if one[0] != 'uneven_error']
+    if not findings:
+        return False
+    code, detail = findings[0]
+    return any(cause == code or cause.startswith(f'{code}: ') and cause.split(': ')[1] in detail for cause in causes)
+
+
+def loss(row, right):
+    """PSNR in dB that an input costs; `None` where it is not known."""
+    return right['unit_db'] - row['unit_db'] if right and 'unit_db' in row and 'unit_db' in right else None
+
+
+BEGIN, END = '<!-- wrong inputs: generated by research/assessment/wrong_inputs.py -->', '<!-- wrong inputs: end -->'
+
+
+def markdown(table):
+    """Lines of the tables of wrong and of right inputs."""
+    yield '| wrong input | finding that names the cause | flagged | cause named first | expected PSNR in spite of a loss above 3 dB |'
+    yield '| --- | --- | --- | --- | --- |'
+    for name, (kind, count, flagged, named, praised) in table.items():
+        if kind.what != RIGHT:
+            said = ' or '.join('an error' if cause.startswith('refused') else f'`{cause}`' for cause in kind.causes)
+            shown = '' if praised is None else f'{praised[0]} of {praised[1]}'
+            yield f'| {name}{" (not visible in one snapshot)" if kind.what == HIDDEN else ""} | {said} | {flagged} of {count} | {named} of {count} | {shown} |'
+    yield ''
+    yield '| right input | false alarms | graded `bad` above 22 dB |'
+    yield '| --- | --- | --- |'
+    for name, (kind, count, flagged, low, _) in table.items():
+        if kind.what == RIGHT:
+            yield f'| {name.removeprefix("right: ")} | {flagged} of {count} | {low} of {count} |'
+
+
+def write(path, lines):
+    """Replaces the tables in a file."""
+    text = path.read_text()
+    head, rest = text.split(BEGIN)
+    path.write_text('\n'.join([head + BEGIN, *lines, END]) + rest.split(END)[1])
+
+
+def report(a):
+    rows, table, out = read(a.out), {}, {}
+    of = {(row['kind'], row['scene']): row for row in rows}
+    reference = {'': KINDS[0].name, 'steady': 'right: steady motion', 'static': 'right: static scene'}
+    false = []
+    for kind in KINDS:
+        own = sorted((row for row in rows if row['kind'] == kind.name), key=lambda row: row['scene'])
+        right_of = lambda row: of.get((reference[kind.variant], row['scene']))
+        if kind.harmful:
+            own = [row for row in own if (loss(row, right_of(row)) or 0) > kind.harmful]
+        if not own:
+            continue
+        if kind.what == RIGHT:
+            found = [(row, alarms(row)) for row in own]
+            false += [f'{kind.name}, {row["scene"]} {row["about"]}: {found}' for row, found in found if found]
+            table[kind.name] = (kind, len(own), sum(bool(found) for _, found in found), sum(map(is_too_low, own)), None)
+            continue
+        named = [names_cause(row, kind.causes) for row in own]
+        flagged = [bool(alarms(row)) or named for row, named in zip(own, named)]
+        harmful = [row for row in own if (loss(row, right_of(row)) or 0) > LOSS] if kind.masks else []
+        praised = [row for row in harmful if row['grade'] == 'good' or row['expected_db'] is not None and row['grade'] != 'bad']
+        table[kind.name] = (kind, len(own), sum(flagged), sum(named), (len(praised), len(harmful)) if kind.masks else None)
+        out[kind.name] = {'of': len(own), 'flagged': sum(flagged), 'named_first': sum(named)}
+        if not a.markdown:
+            for row, named in zip(own, named):
+                if not named:
+                    codes = [code for code, _ in row['findings']] if 'findings' in row else row['refused'][:150]
+                    lost = loss(row, right_of(row))
+                    print(f'  {kind.name}, {row["scene"]} {row["about"]}: {codes} {row.get("grade")} expected {row.get("expected_db")} true {row.get("true_db") or 0:.1f}'
+                          f' loss {lost if lost is None else round(lost, 1)}')
+    lines = list(markdown(table))
+    print(*lines, sep='\n')
+    if a.write:
+        write(pathlib.Path(a.write), lines)
+    judged = [row for row in rows if row['kind'] == KINDS[0].name and row.get('expected_db') is not None]
+    errors = np.array([min(row['true_db'], 40) - min(row['expected_db'], 40) for row in judged])
+    print()
+    if not a.markdown:
+        print(*false, sep='\n')
+    print(json.dumps({'kinds': out, 'false_alarms': false, 'good': sum(count for kind, count, *_ in table.values() if kind.what == RIGHT),
+                      'prediction_off_by_db': round(float(np.abs(errors).mean()), 2), 'within_1_5_db': round(float((np.abs(errors) < 1.5).mean()), 2)}))
 
 
 def main():
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('binary')
-    p.add_argument('--data', required=True)
-    p.add_argument('--good', type=int, default=60)
-    p.add_argument('--scenes', type=int, default=6, help='scenes for each wrong input')
-    p.add_argument('--algorithm', default='gap-tv')
-    p.add_argument('--side', type=int, default=256)
+    commands = p.add_subparsers(dest='what', required=True)
+    runs = commands.add_parser('run')
+    runs.add_argument('binary', metavar='SCI_RECON_BINARY', type=os.path.abspath)
+    runs.add_argument('--data', required=True)
+    runs.add_argument('--good', type=int, default=60, help='scenes of the first right input')
+    runs.add_argument('--scenes', type=int, default=20, help='scenes of each other input')
+    runs.add_argument('--algorithm', default='gap-tv')
+    runs.add_argument('--side', type=int, default=128, help='side of the images in pixels')
+    runs.add_argument('--kinds', nargs='*', help='only inputs with one of these texts in their names [default: all inputs]')
+    runs.add_argument('--parallel', type=int, default=os.cpu_count(), help='reconstructions at the same time')
+    for command in (runs, commands.add_parser('report')):
+        command.add_argument('--out', required=True, help='the folder of the results')
+        command.add_argument('--markdown', action='store_true', help='print the tables alone')
+        command.add_argument('--write', metavar='FILE', help='a file with the comments between which the tables belong')
     a = p.parse_args()
-    folder = pathlib.Path(tempfile.mkdtemp(prefix='sci-recon-wrong-'))
-    files = sorted(glob.glob(f'{a.data}/photos/val/*.jpg') + glob.glob(f'{a.data}/photos/train/*.jpg'))
-    rng = np.random.default_rng(3)
-    service = Service(a.binary, folder / 'service', ['--workers', '2'])
-    lab, alarms, seen, errors = Lab(service, folder, a.algorithm), [], {}, []
-    try:
-        for index in range(a.good):
-            file = files[index % len(files)]
-            photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE)
-            ratio, pattern, sigma = int(rng.choice(RATIOS)), PATTERNS[index % 3], float(rng.choice(SIGMAS))
-            step, scale = float(rng.choice([0, .3, 1, 2, 4])), float(rng.choice([.3, .5, .8]))
-            frames = panned(photo, ratio, a.side, step, scale)
-            np.save(folder / 'scene.npy', frames.astype(np.float32))
-            for seed, name in ((1, 'one'), (2, 'other')):
-                subprocess.run([a.binary, 'simulate', '--frames', folder / 'scene.npy', '--compression-ratio', str(ratio), '--pattern', pattern,
-                                '--noise-sigma', str(sigma), '--seed', str(seed), '--out', folder / name], check=True, stdout=subprocess.DEVNULL)
-            masks, other = (np.load(folder / name / 'masks.npy') for name in ('one', 'other'))
-            clean, truth = np.load(folder / 'one/measurement.npy').reshape(a.side, a.side), np.load(folder / 'one/truth.npy')
-            dark = np.float32(DARK * clean.mean()) * (1 + .1 * rng.standard_normal(clean.shape, np.float32))
-            right, found = lab.job(masks, clean + dark, dark)
-            true = psnr(found, truth)
-            if right['psnr_db'] is not None:
-                errors.append(min(true, 40) - min(right['psnr_db'], 40))
-            what = flags(right, true=true)
-            if what:
-                alarms.append(f'{pathlib.Path(file).stem} {pattern} Cr {ratio} sigma {sigma:g}: {what}')
-                print('   ', *(reason['detail'] for reason in right['reasons']), sep='\n    ')
-            print(f'{pathlib.Path(file).stem[:30]:30} {pattern:16} {ratio:2} {sigma:4} true {true:5.1f} predicted {shown(right)} {right["grade"]} {what}', flush=True)
-            if index < a.scenes:
-                moved = panned(photo, ratio, a.side, 10, scale)
-                fast = (masks * moved).sum(0) + clean - (masks * truth).sum(0)      # the same noise
-                for name, wrong in wrongs(masks, other, clean, dark, fast):
-                    got, frames = lab.job(**wrong)
-                    what = flags(got, right)
-                    if name.startswith('motion') and psnr(frames, moved) > true - FALL:
-                        print(f'    {name:32} does no harm here: {psnr(frames, moved):.1f} dB')
-                        continue
-                    seen.setdefault(name, []).append(bool(what))
-                    print(f'    {name:32} predicted {shown(got)} {got["grade"]:6} {what}', flush=True)
-    finally:
-        service.process.terminate()
-        shutil.rmtree(folder, ignore_errors=True)
-    errors = np.array(errors)
-    print(json.dumps({'flagged': {name: f'{sum(of)} of {len(of)}' for name, of in seen.items()}, 'false_alarms': alarms, 'good': a.good,
-                      'prediction_off_by_db': round(float(np.abs(errors).mean()), 2), 'within_1_5_db': round(float((np.abs(errors) < 1.5).mean()), 2)}))
+    {'run': run, 'report': report}[a.what](a)
 
 
 if __name__ == '__main__':

@@ -375,13 +375,14 @@ impl<'a> Input<'a> {
         };
         let has_dark = !dark.is_empty();
         let arrays = (masks.array.view(), measurement.array.view());
-        let judged = judge(arrays, mosaic, has_dark)?;
+        let (calibration, judged) = judge(arrays, mosaic, has_dark)?;
         let judged = judged.into_iter().map(|finding| {
             // Findings count from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
             Finding { snapshot, ..finding }
         });
-        let findings = intake::combined(read.passed.findings, judged.collect());
+        let mut findings: Vec<Finding> = calibration.into_iter().collect();
+        findings.extend(intake::combined(read.passed.findings, judged.collect()));
         Ok(Self { sources, masks, measurement, first, truth, mosaic, findings })
     }
 
@@ -437,20 +438,18 @@ impl<'a> Input<'a> {
     }
 }
 
-/// Runs the checks of the service on masks \[B,H,W\] and snapshots \[S,H,W\]. The checks read prepared files, so the
-/// arrays are written to temporary ones.
+/// Runs the checks of the service on masks \[B,H,W\] and snapshots \[S,H,W\], and returns the warning of the masks and the
+/// findings on the snapshots. The checks read prepared files, so the arrays are written to temporary ones.
 fn judge(
     (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
     mosaic: Option<Mosaic>,
     has_dark: bool,
-) -> Result<Vec<Finding>> {
+) -> Result<(Option<Finding>, Vec<Finding>)> {
     let limits = Limits::default();
     let prepared = [prepare(masks)?, prepare(snapshots)?];
     let paths = (prepared[0].path(), prepared[1].path());
-    let mut findings = intake::judge(paths, mosaic, has_dark, &limits)?;
     let report = intake::report(&planar::Reader::open(paths.0, &limits)?, &mut |_| true)?;
-    findings.extend(report.report.warning());
-    Ok(findings)
+    Ok((report.report.warning(), intake::judge(paths, mosaic, has_dark, &limits)?))
 }
 
 fn prepare(frames: ArrayView3<'_, f32>) -> Result<tempfile::NamedTempFile> {

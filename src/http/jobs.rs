@@ -288,10 +288,11 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
-    spec.warnings = warnings_of(measurement.warnings, spec.snapshots);
-    // If the report is not finished yet, the task that writes it adds the warning.
+    // If the report is not finished yet, the task that writes it adds the warning. A bad calibration causes other findings,
+    // so it comes first.
     let report = app.store.report(calibration.id).await?;
-    spec.warnings.extend(report.and_then(|report| report.warning()));
+    spec.warnings = report.and_then(|report| report.warning()).into_iter().collect();
+    spec.warnings.extend(warnings_of(measurement.warnings, spec.snapshots));
     check_memory(app, &spec)?;
     check_networks(app, &spec)?;
     Ok(spec)
@@ -337,9 +338,7 @@ fn check_networks(app: &App, spec: &JobSpec) -> Result<()> {
     }
     app.networks().map_err(|missing| {
         let name = spec.algorithm.into_str();
-        let detail = format!(
-            "{name} runs a network, and this service has {missing}; gap-tv3d needs no network"
-        );
+        let detail = format!("{name} runs a network, but {missing}; gap-tv3d needs no network");
         ApiError::field("/algorithm", detail)
     })
 }

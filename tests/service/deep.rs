@@ -41,7 +41,10 @@ async fn without_the_library_a_deep_job_is_rejected() {
     let body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet"});
     let detail = app.post("/v1/jobs", &body).await.problem(422, "invalid_request");
     assert!(detail.contains("lib.so") && !detail.contains("/nowhere"), "{detail}");
-    assert!(detail.contains("scripts/fetch") && detail.contains("gap-tv3d needs none"), "{detail}");
+    assert!(
+        detail.contains("scripts/fetch") && detail.contains("gap-tv3d needs no network"),
+        "{detail}"
+    );
     // Jobs without a network still run.
     let body = json!({"measurement": measurement, "algorithm": "gap-tv"});
     assert_eq!(app.ended(&app.submit(&body).await).await["state"], "succeeded");

@@ -158,8 +158,12 @@ async fn a_job_warns_of_a_bad_calibration_and_of_shifted_masks() {
         !codes.contains(&"weak_modulation".into()),
         "no finding concerns the optics: {codes:?}"
     );
-    let late = app.submit(&body).await;
-    assert_eq!(warned(&app.ended(&late).await), 1);
+    let late = app.ended(&app.submit(&body).await).await;
+    assert_eq!(warned(&late), 1);
+    // The bad calibration comes first, and the scale of the masks counts in the verdict.
+    assert_eq!(late["warnings"][0]["code"], "bad_calibration", "{late:#}");
+    assert_eq!(late["warnings"][1]["code"], "mask_scale", "{late:#}");
+    assert_eq!(late["assessment"]["psnr_db"], Value::Null, "{late:#}");
 }
 
 #[tokio::test]

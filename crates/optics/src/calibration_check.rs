@@ -104,16 +104,8 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
             ),
         ));
     }
-    if figures.largest > 0.0 && figures.largest < 0.5 {
-        // The optics cannot be the reason: in any of them the most open pixel is near 1.
-        findings.push(Finding::new(
-            FindingCode::MaskScale,
-            format!(
-                "the largest mask value is {:.4} of the full scale, but should be near 1: the masks probably have \
-                 fewer bits than their data type",
-                figures.largest
-            ),
-        ));
+    if let Some(finding) = mask_scale(figures.largest) {
+        findings.push(finding);
     } else if figures.mean_deviation() < 0.03 && figures.frame_means.len() > 1 {
         findings.push(Finding::new(
             FindingCode::WeakModulation,
@@ -135,6 +127,22 @@ pub fn judge_masks(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>)
     }
     findings.extend(swapped_order(figures, patterns));
     findings
+}
+
+/// The largest mask value is near 1 in any optics: the most open pixel passes nearly all light.
+const MIN_LARGEST_MASK: f32 = 0.5;
+
+/// Masks with values far below their full scale.
+pub(super) fn mask_scale(largest: f32) -> Option<Finding> {
+    (largest > 0.0 && largest < MIN_LARGEST_MASK).then(|| {
+        Finding::new(
+            FindingCode::MaskScale,
+            format!(
+                "the largest mask value is {largest:.4} of the full scale, but should be near 1: the masks probably \
+                 have fewer bits than their data type"
+            ),
+        )
+    })
 }
 
 /// Pixels that are dark in every mask, and pixels that are open in every mask, if there are more of them than chance

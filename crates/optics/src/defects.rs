@@ -73,7 +73,8 @@ const MUCH_LIGHT: f32 = 0.75;
 /// Neighbours are `step` pixels apart: 2 behind a mosaic, where they have one colour.
 ///
 /// The brightness of the scene at a pixel is at least `y / light`. A hot pixel exceeds both the values and `light` times the
-/// brightness of nearly all of its 24 neighbours twice. A dead one has a twentieth of that brightness.
+/// brightness of nearly all of its 24 neighbours twice. A dead one has a twentieth of that brightness. Dead rows and columns
+/// are found as wholes.
 pub fn outliers(
     y: ArrayView2<'_, f32>,
     light: ArrayView2<'_, f32>,
@@ -129,7 +130,54 @@ pub fn outliers(
             own > MUCH_LIGHT * mean_light && expected > deficit && value < TOO_DARK * expected;
         is_hot || is_dead
     };
-    y.indexed_iter().filter(is_outlier).map(|(place, _)| place).collect()
+    let mut places: Vec<_> = y.indexed_iter().filter(is_outlier).map(|(place, _)| place).collect();
+    let levels = (mean_light, deficit);
+    places.extend(dead_lines(y, light, step, levels));
+    let columns = dead_lines(y.t(), light.t(), step, levels).into_iter();
+    places.extend(columns.map(|(column, row)| (row, column)));
+    places.sort_unstable();
+    places.dedup();
+    places
+}
+
+/// A line of pixels is dead if this share of at least this many pixels is.
+const DEAD_LINE: f64 = 0.8;
+const MIN_LINE: usize = 16;
+
+/// Pixels of dead rows and columns of a sensor. Each is compared with the pixels on both sides of its line, because those
+/// along it are dead too. The arguments are those of [`outliers`].
+fn dead_lines(
+    y: ArrayView2<'_, f32>,
+    light: ArrayView2<'_, f32>,
+    step: usize,
+    (mean_light, deficit): (f32, f32),
+) -> Vec<(usize, usize)> {
+    let (height, width) = y.dim();
+    let is_dead = |row: usize| {
+        let (mut dead, mut compared) = (0usize, 0usize);
+        for column in 0..width {
+            let (mut near, mut near_light) = (0.0, 0.0);
+            for other in [row.checked_sub(step), Some(row + step)].into_iter().flatten() {
+                if other < height && y[[other, column]].is_finite() {
+                    near += y[[other, column]];
+                    near_light += light[[other, column]];
+                }
+            }
+            let own = light[[row, column]];
+            let comparable =
+                own > MUCH_LIGHT * mean_light && near_light > ENOUGH_LIGHT * mean_light;
+            let expected = own * near / near_light;
+            if comparable && expected > deficit {
+                compared += 1;
+                dead += usize::from(y[[row, column]] < TOO_DARK * expected);
+            }
+        }
+        #[allow(clippy::cast_precision_loss)] // counts of pixels
+        let share = dead as f64 / compared.max(1) as f64;
+        compared >= MIN_LINE && share > DEAD_LINE
+    };
+    let rows = (0..height).filter(|row| is_dead(*row));
+    rows.flat_map(|row| (0..width).map(move |column| (row, column))).collect()
 }
 
 /// Inserts a value into a list in order and drops the last one.
@@ -274,6 +322,20 @@ mod tests {
             places.iter().for_each(|place| y[*place] = hot);
             let found = outliers(y.view(), light.view(), 1);
             assert_eq!(found, places, "{frames}");
+        }
+    }
+
+    #[test]
+    fn dead_rows_and_columns_are_found_as_wholes() {
+        for (frames, masks) in [4, 8, 16].into_iter().flat_map(|b| all_masks(b).map(|m| (b, m))) {
+            let light = masks.sum_axis(Axis(0));
+            let mut y = measure(masks.view(), (scene(frames) * 0.5 + 0.4).view()).unwrap();
+            y.column_mut(33).fill(0.0);
+            y.row_mut(0).fill(-0.02);
+            let found = outliers(y.view(), light.view(), 1);
+            let is_dead = |(row, column): (usize, usize)| row == 0 || column == 33;
+            assert!(found.iter().copied().all(is_dead), "{frames}");
+            assert_eq!(found.len(), 96 + 95, "{frames}");
         }
     }
 

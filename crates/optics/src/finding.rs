@@ -171,7 +171,7 @@ impl FindingCode {
                  and aberrations)",
             ),
             Self::MaskScale => (
-                &[Calibration],
+                &[Calibration, Measurement],
                 Warning,
                 Warning,
                 "the largest mask value is far below the full scale",
@@ -262,7 +262,7 @@ impl FindingCode {
                 &[Measurement],
                 Error,
                 Error,
-                "a snapshot has only two values, as masks have",
+                "a snapshot has only two values, as masks have, or is a copy of a mask",
                 "send the snapshots of the camera as the measurement, and the masks to the calibration",
             ),
             Self::EmptySnapshot => (
@@ -290,7 +290,7 @@ impl FindingCode {
                 &[Measurement, Result],
                 Warning,
                 Warning,
-                "the brightness of the scene is implausible, for example a mean below 0.05 or above 1.05 of the full scale",
+                "the brightness of the scene is implausible, for example below 0.12 or above 1.1 of the full scale in its brightest parts",
                 "state the `full_scale` of the measurement for its exposure and bit depth",
             ),
             Self::NoDark => (
@@ -334,8 +334,9 @@ impl FindingCode {
                 &[Measurement],
                 Error,
                 Error,
-                "the masks fit better when shifted (by up to 4 pixels)",
-                "the optics moved since the calibration: calibrate again",
+                "the masks fit better when shifted (by up to 32 pixels)",
+                "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
+                 calibration: calibrate again",
             ),
             Self::DriftedMasks => (
                 &[Measurement],

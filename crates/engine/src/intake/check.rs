@@ -1,12 +1,10 @@
 //! Checks masks and measurements while they are read.
 //!
-//! Frames are scaled one at a time, and dark frames are subtracted from a measurement. Afterwards windows of some
-//! snapshots are checked against the masks of the calibration.
+//! Frames are scaled one at a time, and dark frames are subtracted from a measurement.
 
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Array3, ArrayView2, Axis};
+use ndarray::{Array2, ArrayView2, Axis};
 
 use super::IntakeError;
 use super::captures::{average, saturation_level};
@@ -19,17 +17,9 @@ use formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use formats::{
     self, Expected, FormatError, FrameReader, Limits, Part, SampleType, StackInfo, Wanted,
 };
-use optics::{
-    BitUsage, Defects, MeasurementFigures, MeasurementStudy, REACH, judge_defects,
-    judge_measurement,
-};
-use reconstruction::unmeasured::filled;
+use optics::{BitUsage, Defects, judge_defects};
 
-/// Side of a checked window without its margin, in pixels.
-const WINDOW: usize = 64;
-/// Number of checked windows along each side of a picture.
-const WINDOWS: usize = 4;
-/// Number of checked snapshots of a measurement.
+/// Number of snapshots that findings of one kind name.
 const SNAPSHOTS: usize = 8;
 
 /// The conditions of a measurement's exposure.
@@ -132,9 +122,9 @@ pub fn measurement(
     let empty =
         check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
     let judge = |bits: BitUsage| bits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
-    let mut findings: Vec<_> =
-        exposed.bits.and_then(judge).map(Finding::from).into_iter().collect();
-    findings.extend(defect_findings(&exposed.defects, info.height * info.width));
+    // Saturation explains why no value is larger, so it comes first.
+    let mut findings = defect_findings(&exposed.defects, info.height * info.width);
+    findings.extend(exposed.bits.and_then(judge).map(Finding::from));
     findings.extend(empty.into_iter().take(SNAPSHOTS).map(|snapshot| {
         let finding = Finding::new(FindingCode::EmptySnapshot, "the snapshot is 0 everywhere");
         Finding { snapshot: u32::try_from(snapshot).ok(), ..finding }
@@ -234,231 +224,5 @@ impl FrameReader for Exposed<'_> {
             frame -= dark;
         }
         Ok(Some(frame))
-    }
-}
-
-/// Combines the findings of reading a measurement with those of its [check](judge), causes before their effects.
-///
-/// Masks of another place make many pixels look like outliers. Pixels that were saturated leave the darker ones, which
-/// looks like light that the masks do not explain.
-pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding> {
-    use FindingCode::{
-        BadPixels, DriftedMasks, ForeignMasks, Level, NegativeOffset, NoDark, Saturated,
-        ShiftedMasks, TurnedMasks, WrongDark,
-    };
-    let is_one_of =
-        |finding: &Finding, codes: &[FindingCode]| codes.iter().any(|code| finding.is(*code));
-    let snapshots_with = |findings: &[Finding], codes: &[FindingCode]| -> Vec<Option<u32>> {
-        let found = findings.iter().filter(|finding| is_one_of(finding, codes));
-        found.map(|finding| finding.snapshot).collect()
-    };
-    let wrong_masks = [ShiftedMasks, TurnedMasks, ForeignMasks];
-    let with_wrong_masks = snapshots_with(&judged, &wrong_masks);
-    read.retain(|finding| !(finding.is(BadPixels) && with_wrong_masks.contains(&finding.snapshot)));
-    let saturated = snapshots_with(&read, &[Saturated]);
-    let offsets = [DriftedMasks, NoDark, NegativeOffset, WrongDark, Level];
-    judged
-        .retain(|finding| !(is_one_of(finding, &offsets) && saturated.contains(&finding.snapshot)));
-    let (mut findings, others): (Vec<_>, Vec<_>) =
-        judged.into_iter().partition(|finding| is_one_of(finding, &wrong_masks));
-    findings.extend(read);
-    findings.extend(others);
-    findings
-}
-
-/// Checks a few snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
-/// the first green sub-image is checked. `dark_subtracted` is true if dark frames were subtracted.
-///
-/// Errors: files that can't be read.
-pub fn judge(
-    (masks, snapshots): (&Path, &Path),
-    mosaic: Option<Mosaic>,
-    dark_subtracted: bool,
-    limits: &Limits,
-) -> Result<Vec<Finding>, FormatError> {
-    let (masks, snapshots) = (Reader::open(masks, limits)?, Reader::open(snapshots, limits)?);
-    let count = snapshots.info().frames;
-    let mut findings = Vec::new();
-    for sample in 0..count.min(SNAPSHOTS) {
-        let snapshot = sample * count / count.min(SNAPSHOTS);
-        let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
-        let Some(figures) = studied.finish() else { continue };
-        let number = u32::try_from(snapshot).ok();
-        let mut judged = judge_measurement(&figures, dark_subtracted);
-        if judged.iter().any(|finding| finding.code == FindingCode::ForeignMasks)
-            && let Some(turned) = turned_masks((&masks, &snapshots), snapshot, mosaic, &figures)?
-        {
-            judged.retain(|finding| finding.code != FindingCode::ForeignMasks);
-            judged.push(turned);
-        }
-        // The user has stated the mosaic.
-        judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
-        let judged = judged.into_iter();
-        findings
-            .extend(judged.map(|finding| Finding { snapshot: number, ..Finding::from(finding) }));
-    }
-    Ok(findings)
-}
-
-/// Another orientation of masks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-struct Turn {
-    /// Rows and columns are exchanged, before flips.
-    transposed: bool,
-    rows_flipped: bool,
-    columns_flipped: bool,
-}
-
-impl Turn {
-    /// All orientations of masks of this size other than the given one.
-    fn others(height: usize, width: usize) -> Vec<Self> {
-        let turn = |code: usize| Self {
-            transposed: code & 1 == 1,
-            rows_flipped: code & 2 == 2,
-            columns_flipped: code & 4 == 4,
-        };
-        (1..8).map(turn).filter(|turn| height == width || !turn.transposed).collect()
-    }
-
-    /// Reads the window of the turned masks \[B,h,w\].
-    fn read(
-        self,
-        masks: &Reader,
-        (rows, columns): (&Range<usize>, &Range<usize>),
-    ) -> Result<Array3<f32>, FormatError> {
-        let (frames, height, width) =
-            (masks.info().frames, masks.info().height, masks.info().width);
-        let mirrored = |range: &Range<usize>, length: usize, flipped: bool| {
-            if flipped { length - range.end..length - range.start } else { range.clone() }
-        };
-        let mut place = (
-            mirrored(rows, height, self.rows_flipped),
-            mirrored(columns, width, self.columns_flipped),
-        );
-        if self.transposed {
-            place = (place.1, place.0);
-        }
-        let mut band = masks.read_window(0..frames, place.0, place.1)?;
-        if self.transposed {
-            band.swap_axes(1, 2);
-        }
-        if self.rows_flipped {
-            band.invert_axis(Axis(1));
-        }
-        if self.columns_flipped {
-            band.invert_axis(Axis(2));
-        }
-        Ok(band.as_standard_layout().into_owned())
-    }
-
-    fn describe(self) -> String {
-        let parts = [
-            (self.transposed, "their rows and columns are exchanged"),
-            (self.rows_flipped, "they are flipped upside down"),
-            (self.columns_flipped, "they are flipped from left to right"),
-        ];
-        let parts: Vec<_> = parts.iter().filter(|(is, _)| *is).map(|(_, text)| *text).collect();
-        parts.join(" and ")
-    }
-}
-
-/// Largest share of the explanation by turned masks that given masks have, if the turned ones are right.
-const TURNED_GAIN: f64 = 4.0;
-/// Smallest share of the fine structure that masks explain in the right orientation.
-const MIN_EXPLAINED: f64 = 0.08;
-
-/// Looks for an orientation of the masks that explains a snapshot, which the given one does not.
-fn turned_masks(
-    files: (&Reader, &Reader),
-    snapshot: usize,
-    mosaic: Option<Mosaic>,
-    given: &MeasurementFigures,
-) -> Result<Option<optics::Finding>, FormatError> {
-    if mosaic.is_some() {
-        return Ok(None);
-    }
-    let (height, width) = (files.0.info().height, files.0.info().width);
-    let mut best: Option<(f64, Turn)> = None;
-    for turn in Turn::others(height, width) {
-        let figures = study(files, snapshot, None, turn)?.finish();
-        let explained = figures.map_or(0.0, |figures| figures.explained_unshifted);
-        if best.is_none_or(|(most, _)| explained > most) {
-            best = Some((explained, turn));
-        }
-    }
-    let right = best.filter(|(explained, _)| {
-        *explained > MIN_EXPLAINED && *explained > TURNED_GAIN * given.explained_unshifted
-    });
-    Ok(right.map(|(explained, turn)| {
-        let axes = if turn == (Turn { transposed: true, ..Turn::default() }) {
-            ". The masks were probably read with a wrong order of axes: state `frame-column-row` as `axes` where \
-             `frame-row-column` was taken, and the other way round"
-        } else {
-            ""
-        };
-        let detail = format!(
-            "the masks explain {:.0} % of the fine structure of the measurement when {}, but only {:.1} % as they are\
-             {axes}",
-            100.0 * explained,
-            turn.describe(),
-            100.0 * given.explained_unshifted
-        );
-        optics::Finding::new(FindingCode::TurnedMasks, detail)
-    }))
-}
-
-/// Computes the statistics of windows that are spread evenly over a snapshot, with turned masks.
-fn study(
-    (masks, snapshots): (&Reader, &Reader),
-    snapshot: usize,
-    mosaic: Option<Mosaic>,
-    turn: Turn,
-) -> Result<MeasurementStudy, FormatError> {
-    let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
-    let ((row, column), step) = mosaic.map_or(((0, 0), 1), |mosaic| (mosaic.green(), 2));
-    // Sensor pixels of a window of the sub-image.
-    let sensor_pixels = |window: &Range<usize>, first: usize| {
-        first + window.start * step..first + (window.end * step + 1).saturating_sub(step)
-    };
-    let mut study = MeasurementStudy::new(frames);
-    for rows in windows(height / step) {
-        for columns in windows(width / step) {
-            let place = (sensor_pixels(&rows, row), sensor_pixels(&columns, column));
-            let band = match turn == Turn::default() {
-                true => masks.read_lattice(0..frames, place.clone(), step)?,
-                false => turn.read(masks, (&place.0, &place.1))?,
-            };
-            let y = snapshots.read_lattice(snapshot..snapshot + 1, place, step)?;
-            let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
-            study.add(band.view(), filled(y.index_axis(Axis(0), 0)).view());
-        }
-    }
-    Ok(study)
-}
-
-/// Windows with their margins along one side. All start at even pixels. A short side has one window.
-fn windows(length: usize) -> Vec<Range<usize>> {
-    let side = WINDOW + 2 * REACH;
-    let count = (length / side).clamp(1, WINDOWS);
-    let side = if count == 1 { length.min(2 * side) } else { side };
-    let start = |index: usize| match count {
-        1 => ((length - side) / 2) & !1,
-        // Even starts keep the phases of a mosaic.
-        _ => (index * (length - side) / (count - 1)) & !1,
-    };
-    (0..count).map(|index| start(index)..start(index) + side).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::windows;
-
-    #[test]
-    fn windows_are_spread_over_sides_of_any_length() {
-        assert_eq!(windows(48).first(), Some(&(0..48)));
-        assert_eq!(windows(143).first(), Some(&(0..143)));
-        assert_eq!(windows(144), [0..72, 72..144]);
-        assert_eq!(windows(3200).last(), Some(&(3128..3200)));
-        assert!((1..4000).all(|length| windows(length).iter().all(|window| window.end <= length)));
     }
 }

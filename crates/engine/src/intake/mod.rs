@@ -7,6 +7,7 @@ mod bad_pixels;
 mod captures;
 mod check;
 mod error;
+mod judge;
 mod open;
 mod read;
 mod refusal;
@@ -15,8 +16,9 @@ mod sample;
 
 pub use bad_pixels::bad_pixels;
 pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
-pub use check::{Behind, Exposure, Passed, combined, judge, masks, measurement};
+pub use check::{Behind, Exposure, Passed, masks, measurement};
 pub use error::IntakeError;
+pub use judge::{combined, judge};
 pub use open::{Opened, Source};
 pub use read::{
     Scaled, Snapshots, read_clip, read_colours, read_masks, read_snapshots, read_truth,

@@ -202,14 +202,18 @@ pub fn expected(
 /// knows only results with the right ones.
 fn is_in_doubt(findings: &[Finding]) -> bool {
     use FindingCode::{
-        BadCalibration, ExchangedMasks, ForeignMasks, MaskScale, Mosaic, Negative, NegativeOffset,
-        NoDark, ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
+        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks, MaskScale,
+        MissingPattern, Mosaic, Negative, NegativeOffset, NoDark, ShiftedMasks, TurnedMasks,
+        UnexplainedPixels, WrongDark,
     };
-    const DOUBTS: [FindingCode; 12] = [
+    const DOUBTS: [FindingCode; 15] = [
         BadCalibration,
+        BinaryMeasurement,
+        DriftedMasks,
         ExchangedMasks,
         ForeignMasks,
         MaskScale,
+        MissingPattern,
         Mosaic,
         Negative,
         NegativeOffset,

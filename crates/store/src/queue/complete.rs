@@ -216,9 +216,13 @@ impl Store {
             calibrations::insert_made(transaction, id, prepared, facts).await?;
         }
         if let Some(warning) = done.report.warning() {
+            // A bad calibration causes other findings, so it comes first.
             sql!(
-                "UPDATE jobs SET spec = json_insert(spec, '$.warnings[#]', json(?))
-                 WHERE calibration = ? AND finished_at IS NULL",
+                "UPDATE jobs SET spec = json_set(spec, '$.warnings', (
+                     SELECT json_group_array(json(value)) FROM (
+                         SELECT ?1 AS value
+                         UNION ALL SELECT value FROM json_each(jobs.spec, '$.warnings'))))
+                 WHERE calibration = ?2 AND finished_at IS NULL",
                 [Json(&warning), id]
             )
             .execute(&mut *transaction)
