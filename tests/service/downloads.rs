@@ -122,7 +122,8 @@ async fn slow_clients_do_not_block_others() {
     assert!(answers.len() > 20, "{}", answers.len());
     for (status, took) in answers {
         assert_eq!(status, 200);
-        assert!(took < Duration::from_secs(5), "an answer took {took:?}");
+        // The fault made answers wait for 30 s. A busy machine may need some of this time.
+        assert!(took < Duration::from_secs(15), "an answer took {took:?}");
     }
 }
 
