@@ -34,10 +34,17 @@ export async function submit(page, checks, scene, small) {
   await drop(page, masks, "loud.npy", small.loud());
   await page.click(".askscale >> text=255 means 1");
   await page.waitForSelector("text=The calibration is accepted.");
-  checks.that((await page.$(".askscale")) === null, "the question for the full scale disappears without another upload");
+  checks.that(await page.isHidden(".askscale"), "the question for the full scale disappears without another upload");
   await drop(page, masks, "cube.npy", drawn(40, 48, 56).masks);
   await page.click(".askscale >> text=frame, row, column");
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('40 of 48 × 56')");
+  // Arrays of a MATLAB file are picked by their names, without typing.
+  await drop(page, masks, "bench.mat", small.matlab());
+  await page.click(".askscale >> text=patterns");
+  await page.waitForSelector("text=The calibration is accepted.");
+  await drop(page, data, "bench.mat", small.matlab());
+  await page.click(".askscale >> text=shots");
+  await page.waitForSelector("text=The measurement fits the calibration.");
   await page.fill("#calibration-name", "bench 3");
   await drop(page, masks, "masks.npy", scene.masks);
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('960')");
@@ -201,8 +208,10 @@ export async function view(page, checks, frames) {
   await page.selectOption("#mode", "frame");
   // Each frame is an EXR and a PNG. Add stack, array, manifest, TIFF, movie and ZIP.
   const status = (links) => Promise.all(links.map((link) => fetch(link.href, { method: "HEAD" }).then((answer) => answer.status)));
-  const answers = await page.$$eval(".downloads a[download]", status);
+  const answers = await page.$$eval(".downloads a[download]:not([href$=gif])", status);
   checks.that(answers.length === 2 * frames + 6 && answers.every((code) => code === 200), "all files can be downloaded");
+  const [saved] = await Promise.all([page.waitForEvent("download"), page.click("text=GIF for presentations")]);
+  checks.that(saved.suggestedFilename().endsWith("_0000_movie.gif"), "a GIF is written and downloaded");
   const line = await page.textContent("pre.line");
   checks.that(line.startsWith("curl -sS http") && line.includes("admm-tv"), "the command repeats the job");
   await page.uncheck("#loop");

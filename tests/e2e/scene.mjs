@@ -49,8 +49,36 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
       black: npy([height, width], new Float32Array(pixels).fill(BLACK)),
     }),
     measurement: npy([1, height, width], measurement),
+    /** A MATLAB file (level 5) with masks and snapshot under names of somebody's own. */
+    matlab: () => mat([["patterns", [height, width, frames], masks], ["shots", [height, width], measurement]]),
     truth: npy([frames, height, width], truth),
   };
+}
+
+/** A MATLAB file of single-precision arrays [name, [rows, columns, frames], values], uncompressed; the values are [frame, row, column]. */
+function mat(arrays) {
+  const element = (type, bytes) => {
+    const tag = Buffer.alloc(8);
+    tag.writeUInt32LE(type, 0);
+    tag.writeUInt32LE(bytes.length, 4);
+    return Buffer.concat([tag, bytes, Buffer.alloc(-bytes.length & 7)]);
+  };
+  const [INT8, INT32, UINT32, SINGLE, MATRIX] = [1, 5, 6, 7, 14];
+  const words = (numbers) => Buffer.from(Int32Array.from(numbers).buffer);
+  const head = Buffer.alloc(128, " ");
+  head.write("MATLAB 5.0 MAT-file");
+  head.fill(0, 116, 124);
+  head.writeUInt16LE(0x0100, 124);
+  head.write("IM", 126);
+  return Buffer.concat([head, ...arrays.map(([name, shape, values]) => {
+    const [rows, columns, frames = 1] = shape;
+    const inColumns = Float32Array.from({ length: values.length }, (_, at) => {
+      const [frame, column, row] = [Math.floor(at / (rows * columns)) % frames, Math.floor(at / rows) % columns, at % rows];
+      return values[(frame * rows + row) * columns + column];
+    });
+    return element(MATRIX, Buffer.concat([element(UINT32, words([SINGLE, 0])), element(INT32, words(shape)),
+      element(INT8, Buffer.from(name)), element(SINGLE, Buffer.from(inColumns.buffer))]));
+  })]);
 }
 
 /** An npy file of little-endian float32. */

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import sys
+import tempfile
 import urllib.request
 import zipfile
 from xml.etree import ElementTree
@@ -14,6 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 import tifffile
 import zarr
+import zarr.storage
+from ome_zarr_models.v05.image import Image
 
 
 def main():
@@ -49,11 +52,12 @@ def main():
             intervals[place] = [imagej.get("finterval"), interval and float(interval)]
             planes = [float(plane.get("DeltaT")) for plane in pixels.findall("{*}Plane")]
             assert len(planes) in (0, len(frames)) and planes == sorted(planes)
-        array = zarr.open_array(
-            f"{base}{place}/exports/zarr", mode="r", storage_options={"client_kwargs": {"headers": headers}}
-        )
-        assert array.shape == frames.shape and array.dtype == np.float32 and array.chunks == (1, *frames.shape[1:])
-        assert (array[:] == frames).all() and (array[-1, 3:5] == frames[-1, 3:5]).all()
+        with tempfile.NamedTemporaryFile(suffix=".zarr.zip") as packed:
+            packed.write(get(f"{place}/exports/zarr_zip"))
+            packed.flush()
+            over_http = {"client_kwargs": {"headers": headers}}
+            check_zarr(zarr.open_group(f"{base}{place}/exports/zarr", mode="r", storage_options=over_http), frames)
+            check_zarr(zarr.open_group(zarr.storage.ZipStore(packed.name, mode="r"), mode="r"), frames)
     archive = get("/exports/zip")
     with zipfile.ZipFile(io.BytesIO(archive)) as file:
         assert file.testzip() is None
@@ -66,6 +70,16 @@ def main():
     cut = len(archive) // 3
     assert archive[:cut] + get("/exports/zip", Range=f"bytes={cut}-") == archive
     print(json.dumps({"intervals": intervals, "members": len(names)}))
+
+
+def check_zarr(group, frames):
+    """Time, channel and space, as OME-Zarr orders them."""
+    frames = frames if frames.ndim == 3 else frames.transpose(0, 3, 1, 2)
+    image = Image.from_zarr(group).ome_attributes.multiscales[0]
+    assert "".join(axis.name for axis in image.axes) == ("tyx" if frames.ndim == 3 else "tcyx")
+    array = group["0"]
+    assert array.shape == frames.shape and array.dtype == np.float32 and array.chunks == (1, *frames.shape[1:])
+    assert (array[:] == frames).all() and (array[-1, ..., 3:5] == frames[-1, ..., 3:5]).all()
 
 
 main()

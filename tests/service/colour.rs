@@ -208,10 +208,10 @@ async fn a_mosaic_is_reconstructed_in_colour() {
     judge_exr(&app.data().join("results").join(&job).join("snapshot_0001"));
 
     // Export formats.
-    let zarr = app.get(&format!("{base}/exports/zarr/zarr.json")).await.expect(200).json();
-    assert_eq!(zarr["shape"], json!([4, 64, 64, 3]));
-    app.get(&format!("{base}/exports/zarr/c/0/0/0")).await.problem(404, "not_found");
-    let chunk = app.get(&format!("{base}/exports/zarr/c/3/0/0/0")).await.expect(200).bytes;
+    let zarr = app.get(&format!("{base}/exports/zarr/0/zarr.json")).await.expect(200).json();
+    assert_eq!(zarr["shape"], json!([4, 3, 64, 64]));
+    app.get(&format!("{base}/exports/zarr/0/c/0/0/0")).await.problem(404, "not_found");
+    let chunk = app.get(&format!("{base}/exports/zarr/0/c/3/0/0/0")).await.expect(200).bytes;
     assert_eq!(chunk.len(), SIDE * SIDE * 3 * 4);
     judge_movies(&app, (&job, SNAPSHOTS), &token).await;
     if let Some(python) = judges() {

@@ -48,15 +48,15 @@ async fn exports_support_caching_and_ranges_like_files() {
     let stuck = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
         {"prior": "tv", "iterations": 10_000, "tv_weight": 0.05, "tv_updates": 40}]}});
     let stuck = app.submit(&stuck).await;
-    let paths = ["exports/tiff", "exports/npy", "exports/zip"];
-    let zarr = ["exports/zarr/zarr.json", "snapshots/0/exports/zarr/c/0/0/0"];
+    let paths = ["exports/tiff", "exports/npy", "exports/zip", "exports/zarr_zip"];
+    let zarr = ["exports/zarr/zarr.json", "snapshots/0/exports/zarr/0/c/0/0/0"];
     for path in paths.iter().chain(&zarr) {
         app.get(&format!("/v1/jobs/{stuck}/{path}")).await.problem(404, "not_ready");
     }
     app.post(&format!("/v1/jobs/{stuck}/cancel"), &json!({})).await.expect(202);
     let job = done(&app).await;
     app.get(&format!("/v1/jobs/{job}/snapshots/2/exports/tiff")).await.problem(404, "not_found");
-    for chunk in ["c/8/0/0", "c/-1/0/0", "c/0/1/0", ".zarray"] {
+    for chunk in ["0/c/8/0/0", "0/c/-1/0/0", "0/c/0/1/0", "c/0/0/0", ".zarray"] {
         let path = format!("/v1/jobs/{job}/exports/zarr/{chunk}");
         app.get(&path).await.problem(404, "not_found");
     }
@@ -92,7 +92,7 @@ async fn exports_support_caching_and_ranges_like_files() {
     let last = bytes.len() - 1;
     bytes[last] ^= 1;
     std::fs::write(&array, bytes).unwrap();
-    for path in ["snapshots/1/exports/tiff", "snapshots/1/exports/zarr/c/3/0/0"] {
+    for path in ["snapshots/1/exports/tiff", "snapshots/1/exports/zarr/0/c/3/0/0"] {
         app.get(&format!("/v1/jobs/{job}/{path}")).await.problem(500, "file_damaged");
     }
     app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/tiff")).await.expect(200);

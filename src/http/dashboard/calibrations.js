@@ -7,7 +7,7 @@ import { View } from "./view.js";
 import { announce, facts, h, place, put } from "./dom.js";
 import { ask, rename, showMessage } from "./actions.js";
 import { every } from "./live.js";
-import { figure, moment, momentInFull, nameOf } from "./format.js";
+import { exact, figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
 import { grade, report } from "./report.js";
 
@@ -111,7 +111,7 @@ function about(item) {
     ["Mean transmission", figure(item.mask_mean)],
     ["Dead pixels", `${item.dead_pixels} (${figure((100 * item.dead_pixels) / pixels, 2)} %)`],
     ["Values below 0, set to 0", item.clipped_negatives],
-    ["Full scale", figure(item.full_scale)],
+    ["Full scale", exact(item.full_scale)],
     ["File", `${item.sample} in ${item.format}`],
     ["SHA-256 of the file", h("code", null, item.masks)],
     ["Identifier", h("code", null, item.id)],

@@ -74,10 +74,10 @@ const SCALES = [1, 255, 1023, 4095, 16383, 65535];
  * Asks for the full scale if the check rejects or questions it. `again(scale)` repeats the request with the same
  * file.
  */
-export function askScale(again) {
+export function askScale(again, question = "Which stored number means 1, the full light of one frame?") {
   const other = h("input", { type: "number", min: 0, step: "any", "aria-label": "Another full scale", placeholder: "other" });
   const use = h("button", { type: "button", class: "small", onclick: () => Number(other.value) > 0 && again(Number(other.value)) }, "Use");
-  return h("div", { class: "askscale", role: "group", "aria-label": "Full scale" }, h("p", null, h("b", null, "Which stored number means 1, the full light of one frame?")),
+  return h("div", { class: "askscale", role: "group", "aria-label": "Full scale" }, h("p", null, h("b", null, question)),
     h("div", { class: "row" }, SCALES.map((scale) => h("button", { type: "button", class: "small", onclick: () => again(scale) }, `${scale} means 1`)), other, use));
 }
 
@@ -91,8 +91,16 @@ function askAxes(error, again) {
     h("div", { class: "row" }, fit.map(([name, words]) => h("button", { type: "button", class: "small", onclick: () => again(name) }, words))));
 }
 
+/** Asks for the array, among those that the error names. */
+function askArray(error, again) {
+  const names = [...error.message.replace(/^.*it contains/, "").matchAll(/'([^']+)'/g)].map(([, name]) => name);
+  return h("div", { class: "askscale", role: "group", "aria-label": "Array" }, h("p", null, h("b", null, "Which array of the file is it?")),
+    h("div", { class: "row" }, names.map((name) => h("button", { type: "button", class: "small", onclick: () => again(name) }, name))));
+}
+
 /** Asks for the setting that an error calls ambiguous; null if there is none. `again` receives it with those stated before. */
 export function askAbout(error, stated, again) {
+  if (error.reason === "missing_array" && error.message.includes("it contains '")) return askArray(error, (array) => again({ ...stated, array }));
   if (error.reason === "axes_ambiguous") return askAxes(error, (axes) => again({ ...stated, axes }));
   const scale = ["above_full_scale", "invalid_full_scale"].includes(error.reason) || (error.errors ?? []).some((item) => item.pointer === "/full_scale");
   return scale ? askScale((full_scale) => again({ ...stated, full_scale })) : null;

@@ -56,6 +56,11 @@ export function figure(value, digits = 3) {
   return String(Number(value.toPrecision(digits)));
 }
 
+/** A number that somebody stated, with all digits of its single precision. */
+export function exact(value) {
+  return value === null || value === undefined ? "–" : String(Number(value.toPrecision(7)));
+}
+
 /** Last 8 characters of an identifier; they differ even between resources created at the same time. */
 export function short(id) {
   return id.slice(-8);
@@ -102,6 +107,13 @@ export function timeOf(job) {
 /** Maximum number of iterations of a schedule on one tile. */
 export function iterationsOf(schedule) {
   return schedule.stages.reduce((sum, stage) => sum + stage.iterations, 0);
+}
+
+/** A succeeded job in one word, as kind and text: its findings limit the grade of its expected PSNR. */
+export function verdictOf(job) {
+  if (job.warnings.some((item) => item.severity === "error")) return ["bad", "bad"];
+  if (job.warnings.length > 0 || job.assessment?.psnr_db === null) return ["usable", "doubtful"];
+  return job.assessment ? [job.assessment.grade, job.assessment.grade] : ["", "not judged"];
 }
 
 /** Number and highest severity of a job's findings; null if there are none. */

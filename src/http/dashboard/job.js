@@ -146,6 +146,6 @@ async function showFiles(element, { id, state, shape, snapshots: { count } }, sn
     ready && movieLink(base, snapshot, "gif", "GIF for presentations", signal),
     ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "mp4", "Movie of all snapshots", signal),
     ready && state === "succeeded" && made(`${base}/exports/zip`, "All files as ZIP"),
-    h("details", null, h("summary", null, `${single.length} single frames`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
+    h("details", null, h("summary", null, `Single frames (${single.length} files)`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;
 }

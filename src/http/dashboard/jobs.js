@@ -2,7 +2,7 @@
 
 import { announce, h, place, put, say } from "./dom.js";
 import { cancelAll, removeAll, actions } from "./actions.js";
-import { aboutDecibels, doubts, expectedRange, nameOf, moment, momentInFull, shapeOf, short, stageOf, timeOf } from "./format.js";
+import { aboutDecibels, doubts, expectedRange, moment, momentInFull, nameOf, shapeOf, short, stageOf, timeOf, verdictOf } from "./format.js";
 import { filters } from "./filters.js";
 import { get } from "./api.js";
 import { table } from "./rows.js";
@@ -195,8 +195,8 @@ function columns(chosen, choose, done) {
     { title: h("span", { class: "unseen" }, "Select"), class: "pick", fill: (cell, job) => pick(cell, job, chosen, choose) },
     { title: h("span", { class: "unseen" }, "Picture"), class: "thumb", fill: thumb },
     { title: "Job", class: "name", fill: name },
+    { title: "Verdict", class: "checks", fill: verdict },
     { title: "State", class: "state", fill: state },
-    { title: "Quality", class: "checks", fill: checks },
     { title: "Frames", class: "shape", fill: (cell, job) => say(cell, shapeOf(job)) },
     { title: "Submitted", class: "created", fill: created },
     { title: h("span", { class: "unseen" }, "Actions"), class: "actions writes", fill: (cell, job, before) => buttons(cell, job, before, done) },
@@ -245,14 +245,17 @@ function state(cell, job, before) {
   say(cell.lastChild, [bar && `${Math.floor(job.progress.percent)} %`, bar && stageOf(job), timeOf(job)].filter(Boolean).join(" · "));
 }
 
-/** Number of findings, and the expected PSNR. */
-function checks(cell, job, before) {
-  if (before && !before.assessment === !job.assessment) return;
+/** The verdict in a word, the number of findings, and the expected PSNR. A job that has not succeeded has only findings. */
+function verdict(cell, job, before) {
+  if (before && before.state === job.state && before.warnings.length === job.warnings.length && !before.assessment === !job.assessment) return;
   const found = doubts(job);
-  const assessment = job.assessment;
-  put(cell, found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text));
-  if (!found && !assessment) put(cell, h("span", { class: "mark fine" }, "no findings"));
-  if (assessment) cell.append(h("span", { class: `sub grade ${assessment.grade}`, title: `Expected PSNR ${expectedRange(assessment)}` }, assessment.psnr_db === null ? assessment.grade : `about ${aboutDecibels(assessment.psnr_db)}`));
+  const psnr = job.assessment?.psnr_db ?? null;
+  const [kind, word] = job.state === "succeeded" ? verdictOf(job) : ["", ""];
+  put(cell, word && h("span", { class: `grade ${kind}` }, word),
+    h("span", { class: "sub" },
+      found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text),
+      found && psnr !== null && " · ",
+      psnr !== null && h("span", { title: `Expected PSNR ${expectedRange(job.assessment)}` }, `about ${aboutDecibels(psnr)}`)));
 }
 
 function created(cell, job) {

@@ -2,9 +2,9 @@
 
 import { announce, calmly, facts, h, put, say } from "./dom.js";
 import { askAbout, askScale, dropZone, problem } from "./drop.js";
-import { bytes, duration, figure } from "./format.js";
+import { bytes, duration, exact, figure } from "./format.js";
 import { Captures } from "./captures.js";
-import { findings } from "./report.js";
+import { findings, grade } from "./report.js";
 import { create, isAborted, get, send } from "./api.js";
 import { given, numberField, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
@@ -94,7 +94,8 @@ function masks(settings, sensor, use, verdict, signal) {
     put(verdict);
     try {
       const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...stated }, signal);
-      put(verdict, accepted(item));
+      const again = (full_scale) => make(sha256, { ...stated, full_scale }).catch((later) => put(verdict, problem(later)));
+      put(verdict, accepted(item, signal), h("details", null, h("summary", null, `The stored number ${exact(item.full_scale)} means 1`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
     } catch (error) {
       const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));
@@ -119,7 +120,7 @@ function captures(settings, use, verdict, signal) {
       put(verdict, words);
       const during = ({ frames, percent }) => say(words, `Computing masks from ${frames} patterns: ${Math.floor(percent)} %`);
       const item = await create("/v1/calibrations", { captures: found.value(), ...settings() }, signal, during);
-      put(verdict, accepted(item));
+      put(verdict, accepted(item, signal));
       use(item);
     } catch (error) {
       if (!isAborted(error)) put(verdict, problem(error));
@@ -132,10 +133,10 @@ function captures(settings, use, verdict, signal) {
   return { element };
 }
 
-function accepted(item) {
+function accepted(item, signal) {
   const dead = item.dead_pixels / (item.height * item.width);
   return [
-    h("p", { class: "good" }, "The calibration is accepted."),
+    h("p", null, "The calibration is accepted. ", grade(item.id, signal)),
     facts([
       ["Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
@@ -227,7 +228,7 @@ function fits(item) {
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
       item.snapshots > 1 && ["Sequence", item.sequence === "contiguous" ? "consecutive, reconstructed jointly where that reduces the error" : "independent snapshots"],
-      ["Full scale", figure(item.full_scale)],
+      ["Full scale", exact(item.full_scale)],
     ]),
   ];
 }

@@ -1,4 +1,4 @@
-//! `results.zip`: all result files of a job, without compression. The layout depends only on names and sizes, so any
+//! ZIP archives of result files and exports, without compression. The layout depends only on names and sizes, so any
 //! range can be composed separately. The crate `zip` can only write an archive from its beginning to its end.
 
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use axum::response::Response;
 use super::super::error::Result;
 use super::super::results::{attachment, result_file};
 use super::clip::Clip;
-use super::composed::{Composed, Framing, Part, Section, Source};
+use super::composed::{Composed, Content, Framing, Part, Section, Source};
 
 /// Version 4.5 of the specification (APPNOTE 4.4.3), the first with files above 4 GiB.
 const VERSION: u16 = 45;
@@ -35,10 +35,13 @@ pub(super) async fn archive(clip: Clip, request: (&Method, &HeaderMap)) -> Resul
     for snapshot in job.spec.snapshots.indices() {
         for file in app.store.result_files(&job, Some(snapshot)).await? {
             let name = format!("snapshot_{snapshot:04}/{}", file.name);
-            members.push((name, Source { snapshot: Some(snapshot), file }));
+            let source = Source { snapshot: Some(snapshot), file };
+            members.push((name, Content::File(Section::whole(source))));
         }
     }
-    members.push((manifest.name.clone(), Source { snapshot: None, file: manifest }));
+    let name = manifest.name.clone();
+    let source = Source { snapshot: None, file: manifest };
+    members.push((name, Content::File(Section::whole(source))));
     let disposition = attachment(job.id, None, "results.zip");
     let composed = Composed { parts: parts(members), kind: "application/zip", disposition };
     composed.send(&app, job, request).await
@@ -53,25 +56,25 @@ struct Member {
     offset: u64,
 }
 
-/// Lays out an archive of these files.
-fn parts(files: Vec<(String, Source)>) -> Vec<Part> {
+/// The parts of an archive of these files.
+pub(super) fn parts(files: Vec<(String, Content)>) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut members = Vec::new();
     let mut offset = 0;
-    let sources: Arc<[Source]> = files.iter().map(|(_, source)| source.clone()).collect();
-    for (name, source) in files {
-        let size = source.file.size;
+    let contents: Arc<[Content]> = files.iter().map(|(_, content)| content.clone()).collect();
+    for (name, content) in files {
+        let size = content.length();
         let member = Member { name, size, offset };
         let length = member.local_header(0).len() as u64;
         offset += length + size;
         members.push(member.clone());
         let make: Framing = Arc::new(move |sums: &[u32]| member.local_header(sums[0]));
-        parts.push(Part::Framing { sources: [source.clone()].into(), length, make });
-        parts.push(Part::File(Section { source, start: 0, length: size }));
+        parts.push(Part::Framing { contents: [content.clone()].into(), length, make });
+        parts.push(Part::Content(content));
     }
     let length = directory(&members, &vec![0; members.len()], offset).len() as u64;
     let make: Framing = Arc::new(move |sums: &[u32]| directory(&members, sums, offset));
-    parts.push(Part::Framing { sources, length, make });
+    parts.push(Part::Framing { contents, length, make });
     parts
 }
 
@@ -178,14 +181,14 @@ mod tests {
 
     use flate2::Crc;
 
-    use super::{Part, Source, parts};
+    use super::{Content, Part, Section, Source, parts};
     use engine::job::{ResultFile, Sha256};
 
-    fn files(sizes: &[u64]) -> Vec<(String, Source)> {
+    fn files(sizes: &[u64]) -> Vec<(String, Content)> {
         let file = |(index, size): (usize, &u64)| {
             let name = format!("file_{index}");
             let file = ResultFile { name: name.clone(), size: *size, sha256: Sha256::of(b"") };
-            (name, Source { snapshot: None, file })
+            (name, Content::File(Section::whole(Source { snapshot: None, file })))
         };
         sizes.iter().enumerate().map(file).collect()
     }
@@ -203,8 +206,8 @@ mod tests {
             let (mut length, mut placed) = (0, Vec::new());
             for part in parts(files(sizes)) {
                 let bytes = match &part {
-                    Part::Framing { sources, make, .. } => {
-                        let sums = sources.iter().map(|source| crc(source.file.size));
+                    Part::Framing { contents, make, .. } => {
+                        let sums = contents.iter().map(|content| crc(content.length()));
                         Some(make(&sums.collect::<Vec<_>>()))
                     }
                     _ => None,

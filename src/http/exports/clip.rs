@@ -1,4 +1,4 @@
-//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, NPY and Zarr. These exports are composed of
+//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, NPY and OME-Zarr. These exports are composed of
 //! the raw frames in `frames.npy`.
 
 use axum::body::Bytes;
@@ -7,7 +7,7 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, Method};
 use axum::response::Response;
 use serde::Deserialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::super::app::App;
 use super::super::conditional;
@@ -15,7 +15,8 @@ use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Caller, Params, canonical_number};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, result_file};
-use super::composed::{Composed, Part, Section, Source};
+use super::archive;
+use super::composed::{Composed, Content, Part, Section, Source};
 use super::format::Format;
 use engine::job::JobId;
 use engine::pipeline::manifest::CameraRecord;
@@ -23,6 +24,9 @@ use formats::{Channels, bigtiff, npy};
 use store::Job;
 
 const ARRAY: &str = "frames.npy";
+/// Metadata of the Zarr group, and of its only array.
+const GROUP: &str = "zarr.json";
+const ARRAY_METADATA: &str = "0/zarr.json";
 
 /// The frames that a path names, and the format in which they are exported.
 pub(in crate::http) struct Clip {
@@ -75,73 +79,45 @@ pub(super) async fn array(clip: Clip, request: (&Method, &HeaderMap)) -> Result<
     clip.send_with_head(head, "application/octet-stream", ARRAY, request).await
 }
 
-/// `zarr/zarr.json`, and the chunks `zarr/c/FRAME/0/0`, or `zarr/c/FRAME/0/0/0` for colours. A chunk is a frame, counted
-/// from 0.
+/// `zarr`: a file of the OME-Zarr group.
 pub(super) async fn zarr(
     clip: Clip,
     path: &str,
     request: (&Method, &HeaderMap),
 ) -> Result<Response> {
-    if path == "zarr.json" {
-        return zarr_json(clip, request.1).await;
-    }
-    let (frames, ..) = clip.shape();
-    let suffix = if clip.channels() == Channels::Rgb { "/0/0/0" } else { "/0/0" };
-    let number = path.strip_prefix("c/").and_then(|rest| rest.strip_suffix(suffix));
-    let frame = number.and_then(canonical_number).filter(|frame| *frame < frames);
-    let frame = frame.ok_or_else(|| {
-        let detail = format!(
-            "the array has zarr.json and the chunks c/0{suffix} to c/{}{suffix}",
-            frames - 1
-        );
-        ApiError::new(Code::NotFound, detail)
-    })?;
-    let per_snapshot = clip.job.spec.shape.frames;
-    let first = clip.snapshot.unwrap_or(clip.job.spec.snapshots.first);
-    let snapshot = first + u32::try_from(frame / per_snapshot).unwrap_or(u32::MAX);
-    let source = clip.source(snapshot).await?;
-    let length = clip.frame_bytes();
-    let start = clip.start(&source)? + (frame % per_snapshot) as u64 * length;
+    let content = match path {
+        GROUP => return conditional::json(&clip.zarr_group().await?, request.1),
+        ARRAY_METADATA => return conditional::json(&clip.zarr_array().await?, request.1),
+        chunk => clip.chunk(chunk).await?,
+    };
     let composed = Composed {
-        parts: vec![Part::File(Section { source, start, length })],
+        parts: vec![Part::Content(Content::File(content))],
         kind: "application/octet-stream",
         disposition: "inline".into(),
     };
     composed.send(&clip.app, clip.job, request).await
 }
 
-/// `zarr.json`: the metadata of the array.
-async fn zarr_json(clip: Clip, headers: &HeaderMap) -> Result<Response> {
-    // Readers take a missing chunk for zeros, so the metadata exist only once all chunks do.
-    clip.sources().await?;
-    let (frames, height, width) = clip.shape();
-    let times = clip.times().await?;
-    let (mut shape, mut names) = (vec![frames, height, width], vec!["frame", "row", "column"]);
-    if clip.channels() == Channels::Rgb {
-        shape.push(clip.channels().count());
-        names.push("colour");
+/// `zarr_zip`: the OME-Zarr group as one file.
+pub(super) async fn zarr_zip(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
+    let json = |value: Value| Content::Bytes(Bytes::from(value.to_string()));
+    let mut files = vec![
+        (GROUP.to_owned(), json(clip.zarr_group().await?)),
+        (ARRAY_METADATA.to_owned(), json(clip.zarr_array().await?)),
+    ];
+    let length = clip.frame_bytes();
+    for (index, source) in clip.sources().await?.into_iter().enumerate() {
+        let start = clip.start(&source)?;
+        for k in 0..clip.job.spec.shape.frames {
+            let frame = index * clip.job.spec.shape.frames + k;
+            let start = start + k as u64 * length;
+            let section = Section { source: source.clone(), start, length };
+            files.push((format!("0/c/{frame}{}", clip.chunk_suffix()), Content::File(section)));
+        }
     }
-    let chunk: Vec<usize> = [1].into_iter().chain(shape[1..].iter().copied()).collect();
-    let array = json!({
-        "zarr_format": 3,
-        "node_type": "array",
-        "shape": shape,
-        "data_type": "float32",
-        "chunk_grid": {
-            "name": "regular",
-            "configuration": { "chunk_shape": chunk },
-        },
-        "chunk_key_encoding": { "name": "default", "configuration": { "separator": "/" } },
-        "codecs": [{ "name": "bytes", "configuration": { "endian": "little" } }],
-        "fill_value": 0.0,
-        "dimension_names": names,
-        "attributes": {
-            "job": clip.job.id,
-            "frame_interval_s": times.interval_s,
-            "frame_times_s": times.starts_s,
-        },
-    });
-    conditional::json(&array, headers)
+    let disposition = attachment(clip.job.id, clip.snapshot, "frames.zarr.zip");
+    let composed = Composed { parts: archive::parts(files), kind: "application/zip", disposition };
+    composed.send(&clip.app, clip.job, request).await
 }
 
 /// Times of the frames in seconds.
@@ -194,6 +170,107 @@ impl Clip {
         values_offset(source, self.job.spec.shape.frames as u64 * self.frame_bytes())
     }
 
+    /// The metadata of the OME-Zarr group (NGFF 0.5): axes, and seconds and pixels per step.
+    async fn zarr_group(&self) -> Result<Value> {
+        // Readers take a missing chunk for zeros, so the metadata exist only once all chunks do.
+        self.sources().await?;
+        let interval_s = self.times().await?.interval_s;
+        let mut time = json!({ "name": "t", "type": "time" });
+        if interval_s.is_some() {
+            time["unit"] = "second".into();
+        }
+        let space = |name| json!({ "name": name, "type": "space" });
+        let mut axes = vec![time, space("y"), space("x")];
+        let mut scale = vec![interval_s.unwrap_or(1.0), 1.0, 1.0];
+        if self.channels() == Channels::Rgb {
+            axes.insert(1, json!({ "name": "c", "type": "channel" }));
+            scale.insert(1, 1.0);
+        }
+        Ok(json!({
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": {
+                "ome": {
+                    "version": "0.5",
+                    "multiscales": [{
+                        "name": self.job.id,
+                        "axes": axes,
+                        "datasets": [{
+                            "path": "0",
+                            "coordinateTransformations": [{ "type": "scale", "scale": scale }],
+                        }],
+                    }],
+                },
+            },
+        }))
+    }
+
+    /// The metadata of the array `0` in the group: float32 \[t, y, x\], or \[t, c, y, x\] for colours. A chunk is a
+    /// frame.
+    async fn zarr_array(&self) -> Result<Value> {
+        self.sources().await?;
+        let (frames, height, width) = self.shape();
+        let times = self.times().await?;
+        let bytes = json!({ "name": "bytes", "configuration": { "endian": "little" } });
+        let (shape, names, codecs) = match self.channels() {
+            Channels::Grey => (vec![frames, height, width], &["t", "y", "x"][..], vec![bytes]),
+            channels @ Channels::Rgb => {
+                // The stored frames are [row, column, colour]; NGFF wants channels before space.
+                let transpose =
+                    json!({ "name": "transpose", "configuration": { "order": [0, 2, 3, 1] } });
+                let shape = vec![frames, channels.count(), height, width];
+                (shape, &["t", "c", "y", "x"][..], vec![transpose, bytes])
+            }
+        };
+        let chunk: Vec<usize> = [1].into_iter().chain(shape[1..].iter().copied()).collect();
+        Ok(json!({
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": shape,
+            "data_type": "float32",
+            "chunk_grid": {
+                "name": "regular",
+                "configuration": { "chunk_shape": chunk },
+            },
+            "chunk_key_encoding": { "name": "default", "configuration": { "separator": "/" } },
+            "codecs": codecs,
+            "fill_value": 0.0,
+            "dimension_names": names,
+            "attributes": {
+                "job": self.job.id,
+                "frame_interval_s": times.interval_s,
+                "frame_times_s": times.starts_s,
+            },
+        }))
+    }
+
+    /// The indices of a chunk after that of its frame.
+    fn chunk_suffix(&self) -> &'static str {
+        if self.channels() == Channels::Rgb { "/0/0/0" } else { "/0/0" }
+    }
+
+    /// The chunk at this path: a frame, counted from 0.
+    async fn chunk(&self, path: &str) -> Result<Section> {
+        let (frames, ..) = self.shape();
+        let suffix = self.chunk_suffix();
+        let number = path.strip_prefix("0/c/").and_then(|rest| rest.strip_suffix(suffix));
+        let frame = number.and_then(canonical_number).filter(|frame| *frame < frames);
+        let frame = frame.ok_or_else(|| {
+            let detail = format!(
+                "the group has {GROUP}, {ARRAY_METADATA} and the chunks 0/c/0{suffix} to 0/c/{}{suffix}",
+                frames - 1
+            );
+            ApiError::new(Code::NotFound, detail)
+        })?;
+        let per_snapshot = self.job.spec.shape.frames;
+        let first = self.snapshot.unwrap_or(self.job.spec.snapshots.first);
+        let snapshot = first + u32::try_from(frame / per_snapshot).unwrap_or(u32::MAX);
+        let source = self.source(snapshot).await?;
+        let length = self.frame_bytes();
+        let start = self.start(&source)? + (frame % per_snapshot) as u64 * length;
+        Ok(Section { source, start, length })
+    }
+
     /// Answers with a file of these first bytes and all frames.
     async fn send_with_head(
         self,
@@ -202,11 +279,11 @@ impl Clip {
         name: &str,
         request: (&Method, &HeaderMap),
     ) -> Result<Response> {
-        let mut parts = vec![Part::Bytes(Bytes::from(head))];
+        let mut parts = vec![Part::Content(Content::Bytes(Bytes::from(head)))];
         for source in self.sources().await? {
             let start = self.start(&source)?;
             let length = source.file.size - start;
-            parts.push(Part::File(Section { source, start, length }));
+            parts.push(Part::Content(Content::File(Section { source, start, length })));
         }
         let disposition = attachment(self.job.id, self.snapshot, name);
         Composed { parts, kind, disposition }.send(&self.app, self.job, request).await

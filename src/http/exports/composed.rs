@@ -8,6 +8,7 @@ use std::sync::Arc;
 use axum::body::{Body, Bytes};
 use axum::http::{HeaderMap, Method};
 use axum::response::Response;
+use flate2::Crc;
 use futures_util::stream::{self, BoxStream, StreamExt, TryStreamExt};
 use sha2::Digest;
 use tokio::fs::File;
@@ -36,16 +37,22 @@ pub(super) struct Section {
     pub(super) length: u64,
 }
 
-/// Composes the bytes between result files, such as headers of an archive, from the CRC-32 of the files.
+/// Bytes that exist before a client reads them.
+#[derive(Debug, Clone)]
+pub(super) enum Content {
+    Bytes(Bytes),
+    File(Section),
+}
+
+/// Composes the bytes between contents, such as headers of an archive, from the CRC-32 of the contents.
 pub(super) type Framing = Arc<dyn Fn(&[u32]) -> Vec<u8> + Send + Sync>;
 
 #[derive(Clone)]
 pub(super) enum Part {
-    Bytes(Bytes),
-    File(Section),
-    /// `length` bytes, which `make` composes from the CRC-32 of the sources.
+    Content(Content),
+    /// `length` bytes, which `make` composes from the CRC-32 of the contents.
     Framing {
-        sources: Arc<[Source]>,
+        contents: Arc<[Content]>,
         length: u64,
         make: Framing,
     },
@@ -66,8 +73,7 @@ impl fmt::Debug for Part {
 impl Part {
     pub(super) fn length(&self) -> u64 {
         match self {
-            Self::Bytes(bytes) => bytes.len() as u64,
-            Self::File(section) => section.length,
+            Self::Content(content) => content.length(),
             Self::Framing { length, .. } => *length,
             Self::Lines { lines, .. } => lines.length(),
         }
@@ -76,8 +82,8 @@ impl Part {
     /// The result files whose bytes are in the part.
     fn sources(&self) -> Vec<&Source> {
         match self {
-            Self::Bytes(_) | Self::Framing { .. } => Vec::new(),
-            Self::File(section) => vec![&section.source],
+            Self::Content(Content::Bytes(_)) | Self::Framing { .. } => Vec::new(),
+            Self::Content(Content::File(section)) => vec![&section.source],
             Self::Lines { source, shared, .. } => vec![source, &shared.source],
         }
     }
@@ -85,16 +91,10 @@ impl Part {
     /// Adds everything that determines the bytes to a hash.
     fn hash_inputs(&self, hasher: &mut sha2::Sha256) {
         match self {
-            Self::Bytes(bytes) => {
-                hasher.update(format!("bytes {}\n", bytes.len()));
-                hasher.update(bytes);
-            }
-            Self::File(section) => section.hash_inputs(hasher),
-            Self::Framing { sources, length, .. } => {
+            Self::Content(content) => content.hash_inputs(hasher),
+            Self::Framing { contents, length, .. } => {
                 hasher.update(format!("framing {length}\n"));
-                sources
-                    .iter()
-                    .for_each(|source| hasher.update(format!("{}\n", source.file.sha256)));
+                contents.iter().for_each(|content| content.hash_inputs(hasher));
             }
             Self::Lines { source, shared, lines } => {
                 hasher.update(format!("{lines:?} {} {}\n", lines.start, source.file.sha256));
@@ -106,17 +106,15 @@ impl Part {
     /// Reads `take` bytes of the part after the first `skip` bytes.
     async fn read(self, app: App, job: Arc<Job>, skip: u64, take: u64) -> io::Result<ByteStream> {
         match self {
-            Self::Bytes(bytes) => Ok(slice_stream(&bytes, skip, take)),
-            Self::File(Section { source, start, .. }) => {
+            Self::Content(Content::Bytes(bytes)) => Ok(slice_stream(&bytes, skip, take)),
+            Self::Content(Content::File(Section { source, start, .. })) => {
                 let section = Section { source, start: start + skip, length: take };
                 Ok(section.read(&app, &job).await?.boxed())
             }
-            Self::Framing { sources, length, make } => {
-                let mut sums = Vec::with_capacity(sources.len());
-                for source in sources.iter() {
-                    let name = &source.file.name;
-                    let sum = app.store.result_crc32(&job, source.snapshot, name).await;
-                    sums.push(sum.map_err(abort)?);
+            Self::Framing { contents, length, make } => {
+                let mut sums = Vec::with_capacity(contents.len());
+                for content in contents.iter() {
+                    sums.push(content.crc32(&app, &job).await?);
                 }
                 let bytes = Bytes::from(make(&sums));
                 debug_assert_eq!(bytes.len() as u64, length);
@@ -131,7 +129,51 @@ impl Part {
     }
 }
 
+impl Content {
+    pub(super) fn length(&self) -> u64 {
+        match self {
+            Self::Bytes(bytes) => bytes.len() as u64,
+            Self::File(section) => section.length,
+        }
+    }
+
+    fn hash_inputs(&self, hasher: &mut sha2::Sha256) {
+        match self {
+            Self::Bytes(bytes) => {
+                hasher.update(format!("bytes {}\n", bytes.len()));
+                hasher.update(bytes);
+            }
+            Self::File(section) => section.hash_inputs(hasher),
+        }
+    }
+
+    async fn crc32(&self, app: &App, job: &Job) -> io::Result<u32> {
+        let mut crc = Crc::new();
+        match self {
+            Self::Bytes(bytes) => crc.update(bytes),
+            // The store remembers the sums of whole files.
+            Self::File(Section { source, start: 0, length }) if *length == source.file.size => {
+                let sum = app.store.result_crc32(job, source.snapshot, &source.file.name).await;
+                return sum.map_err(abort);
+            }
+            Self::File(section) => {
+                let mut bytes = section.read(app, job).await?;
+                while let Some(piece) = bytes.try_next().await? {
+                    crc.update(&piece);
+                }
+            }
+        }
+        Ok(crc.sum())
+    }
+}
+
 impl Section {
+    /// All bytes of a file.
+    pub(super) fn whole(source: Source) -> Self {
+        let length = source.file.size;
+        Self { source, start: 0, length }
+    }
+
     fn hash_inputs(&self, hasher: &mut sha2::Sha256) {
         let Self { source, start, length } = self;
         hasher.update(format!("{start} {length} {}\n", source.file.sha256));
@@ -248,11 +290,12 @@ fn select(parts: Vec<Part>, start: u64, length: u64) -> Vec<Selected> {
 mod tests {
     use axum::body::Bytes;
 
-    use super::{Part, select};
+    use super::{Content, Part, select};
 
     #[test]
     fn a_range_selects_bytes_of_each_part() {
-        let parts = || ["abc", "", "defg"].map(|text| Part::Bytes(Bytes::from(text))).to_vec();
+        let part = |text| Part::Content(Content::Bytes(Bytes::from(text)));
+        let parts = || ["abc", "", "defg"].map(part).to_vec();
         let ranges = |start, length| {
             let selection = select(parts(), start, length);
             selection.iter().map(|selected| (selected.skip, selected.take)).collect::<Vec<_>>()

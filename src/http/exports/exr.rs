@@ -11,7 +11,7 @@ use axum::response::Response;
 use super::super::error::{ApiError, Result};
 use super::super::results::{attachment, media_type, result_file};
 use super::clip::{Clip, values_offset};
-use super::composed::{Composed, Part, Section, Source};
+use super::composed::{Composed, Content, Part, Section, Source};
 use super::lines::{Compose, Lines};
 use engine::job::SceneShape;
 use engine::pipeline::assessment::{BLOCK, blocks};
@@ -62,7 +62,10 @@ async fn parts(clip: &Clip) -> Result<Vec<Part>> {
             compose: compose.clone(),
         },
     };
-    Ok([Part::Bytes(head)].into_iter().chain((0..frames as u64).map(part)).collect())
+    Ok([Part::Content(Content::Bytes(head))]
+        .into_iter()
+        .chain((0..frames as u64).map(part))
+        .collect())
 }
 
 /// Reads the header of the stored stack, and lays out the stack with the additional layer.

@@ -14,8 +14,10 @@ pub(in crate::http) enum Format {
     Npy,
     /// A BigTIFF with a page per frame.
     Tiff,
-    /// A Zarr array, which is a directory of files.
+    /// An OME-Zarr group, which is a directory of files.
     Zarr,
+    /// The OME-Zarr group as one file.
+    ZarrZip,
     /// A movie of all frames.
     Mp4,
     /// A movie of all frames for presentation programs.
