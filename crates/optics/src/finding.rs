@@ -1,8 +1,8 @@
 //! The registry of findings: every code that a check can report, with its severity, title and remedy.
 //!
 //! Checks report a [`Finding`] with a [`FindingCode`] and the numbers of the case. A new finding takes one entry in
-//! this file and the check that reports it. Running the tests with `SCI_RECON_WRITE_FINDINGS=1` then updates the
-//! table in `docs/DATA.md`.
+//! this file and the check that reports it. Running the tests with `SCI_RECON_WRITE_FINDINGS=1` then writes
+//! `docs/FINDINGS.md`.
 
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
@@ -450,14 +450,22 @@ mod tests {
 
     use super::FindingCode;
 
-    /// The lines between these two comments in `docs/DATA.md` are generated.
-    const BEGIN: &str = "findings: generated from crates/optics/src/finding.rs";
-    const END: &str = "findings: end";
+    /// The beginning of `docs/FINDINGS.md`.
+    const HEADER: &str = "\
+<!-- Generated from crates/optics/src/finding.rs. Edit the source and run
+     SCI_RECON_WRITE_FINDINGS=1 cargo test -p sci-recon-optics --lib finding -->
 
-    fn table() -> String {
-        let mut table =
-            "| code | checked | severity | meaning | remedy |\n| --- | --- | --- | --- | --- |\n"
-                .to_owned();
+# Findings
+
+[DATA.md](DATA.md#warnings) explains where findings appear. \"Checked\" names the object that has the finding.
+
+";
+
+    fn page() -> String {
+        let mut page = HEADER.to_owned();
+        page.push_str(
+            "| code | checked | severity | meaning | remedy |\n| --- | --- | --- | --- | --- |\n",
+        );
         for code in FindingCode::VARIANTS {
             let entry = code.entry();
             let subjects: Vec<_> =
@@ -467,33 +475,22 @@ mod tests {
                 severities.into_iter().map(|severity| severity.to_string()).collect();
             let (subjects, severities) = (subjects.join(", "), severities.join(" or "));
             let (title, remedy) = (entry.title, entry.remedy);
-            writeln!(table, "| `{code}` | {subjects} | {severities} | {title} | {remedy} |")
+            writeln!(page, "| `{code}` | {subjects} | {severities} | {title} | {remedy} |")
                 .unwrap();
         }
-        table
-    }
-
-    /// The whole file with the generated part replaced.
-    fn regenerated(text: &str, generated: &str) -> String {
-        let begin = text.find(BEGIN).expect("the opening comment");
-        let begin = begin + text[begin..].find('\n').unwrap() + 1;
-        let end = begin + text[begin..].find(END).expect("the closing comment");
-        let end = text[..end].rfind('\n').unwrap() + 1;
-        format!("{}{generated}{}", &text[..begin], &text[end..])
+        page
     }
 
     #[test]
     fn the_document_lists_every_code() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/DATA.md");
-        let text = std::fs::read_to_string(path).unwrap();
-        let expected = regenerated(&text, &table());
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/FINDINGS.md");
         if std::env::var_os("SCI_RECON_WRITE_FINDINGS").is_some() {
-            std::fs::write(path, &expected).unwrap();
+            std::fs::write(path, page()).unwrap();
             return;
         }
         assert!(
-            text == expected,
-            "docs/DATA.md does not list all findings: run this test with SCI_RECON_WRITE_FINDINGS=1"
+            std::fs::read_to_string(path).unwrap() == page(),
+            "docs/FINDINGS.md is not up to date: run this test with SCI_RECON_WRITE_FINDINGS=1"
         );
     }
 
