@@ -429,11 +429,11 @@ PAGE = """\
 
 # Wrong inputs
 
-`make eval-wrong-inputs` tries each kind of wrong input on many scenes. The table states the [finding](../../docs/FINDINGS.md)
-that names its cause, how many inputs are flagged at all, and for how many the first finding names the cause. The last column
-counts results that lose more than 3 dB by wrong masks and still have an expected PSNR. An order counts where it costs 0.5 dB
-or more, fast motion where it costs 3 dB. [BENCHMARKS.md](../../docs/BENCHMARKS.md#are-wrong-inputs-noticed) states the
-conditions and a summary.
+`make eval-wrong-inputs` tries each kind of wrong input on many scenes. The table states the
+[finding](../../docs/FINDINGS.md) that names its cause, how many inputs are flagged at all, and for how many the first
+finding names the cause. The last column counts results that lose more than 3 dB by wrong masks and still have an
+expected PSNR. An order counts where it costs 0.5 dB or more, fast motion where it costs 3 dB.
+[BENCHMARKS.md](../../docs/BENCHMARKS.md#are-wrong-inputs-noticed) states the conditions and a summary.
 
 """
 
