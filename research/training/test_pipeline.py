@@ -122,6 +122,23 @@ def test_pipeline():
         assert all(np.isfinite(list(r['loop'].values())).all() for r in rows)
 
 
+def test_network_for_one_calibration():
+    with tempfile.TemporaryDirectory() as folder:
+        masks, out, data = os.path.join(folder, 'masks.npy'), os.path.join(folder, 'bench'), make_footage(folder)
+        np.save(masks, solver.draw_masks(np.random.default_rng(0), 'squares', 6, 50))
+        train = lambda: run('calibrated.py', '--masks', masks, '--data', data, '--out', out, '--crop', 32,
+                            '--clips', 2, '--width', 16, '--stages', 2, '--steps', 3, '--threads', 1)
+        train()
+        train()   # continues; the exported network is compared with PyTorch
+        with open(os.path.join(out, 'curve.csv'), encoding='utf8') as f:
+            assert [line.split(',')[1] for line in f][1:] == ['3', '6']
+        with open(os.path.join(out, 'README.md'), encoding='utf8') as f:
+            assert '6 frames of 50x50 pixels' in f.read()
+        frames, = export.session(os.path.join(out, 'network.onnx')).run(None, {
+            'measurement': np.ones((1, 1, 50, 50), np.float32), 'masks': np.load(masks)[None]})
+        assert frames.shape == (1, 6, 50, 50) and np.isfinite(frames).all()
+
+
 if __name__ == '__main__':
     for name, test in list(globals().items()):
         if name.startswith('test_'):
