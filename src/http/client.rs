@@ -52,16 +52,18 @@ impl Client {
 
 /// The hops in the order of the headers: the client first, the last proxy last.
 fn hops(headers: &HeaderMap) -> Vec<Hop> {
-    let values = |name: &str| {
-        let lines = headers.get_all(name).iter().map(|value| value.to_str().unwrap_or_default());
-        lines.flat_map(|line| line.split(',')).map(str::trim).collect::<Vec<_>>()
+    // A proxy appends to the bytes that the client sent, which need not be text.
+    let values = |name: &str| -> Vec<String> {
+        let lines = headers.get_all(name).iter().map(|value| value.as_bytes());
+        let elements = lines.flat_map(|line| line.split(|byte| *byte == b','));
+        elements.map(|element| String::from_utf8_lossy(element).trim().to_owned()).collect()
     };
     let addresses = values("x-forwarded-for");
     if addresses.is_empty() {
-        return values("forwarded").into_iter().map(forwarded).collect();
+        return values("forwarded").iter().map(|element| forwarded(element)).collect();
     }
     let is_https = values("x-forwarded-proto").last().is_some_and(|scheme| is_https(scheme));
-    addresses.into_iter().map(|text| Hop { address: address(text), is_https }).collect()
+    addresses.iter().map(|text| Hop { address: address(text), is_https }).collect()
 }
 
 /// An element of `Forwarded`, such as `for="[2001:db8::1]:4711";proto=https`.
@@ -97,10 +99,13 @@ mod tests {
 
     use super::Client;
 
-    fn client(peer: &str, lines: &[(&'static str, &'static str)]) -> (String, bool) {
+    fn client(peer: &str, lines: &[(&'static str, &str)]) -> (String, bool) {
         let mut headers = HeaderMap::new();
         for (name, value) in lines {
-            headers.append(HeaderName::from_static(name), HeaderValue::from_static(value));
+            headers.append(
+                HeaderName::from_static(name),
+                HeaderValue::from_bytes(value.as_bytes()).unwrap(),
+            );
         }
         let proxies: [IpNet; 2] = ["10.0.0.0/8".parse().unwrap(), "fd00::/8".parse().unwrap()];
         let client = Client::of(peer.parse().unwrap(), &headers, &proxies);
@@ -118,6 +123,8 @@ mod tests {
             // The client sent an address of its choice; the proxy appended the true one.
             ("10.0.0.1", &[("x-forwarded-for", "203.0.113.9, 192.0.2.7")], "192.0.2.7", false),
             ("10.0.0.1", &[("x-forwarded-for", "203.0.113.9"), named], "192.0.2.7", false),
+            // An element that is no text hides nothing behind it.
+            ("10.0.0.1", &[("x-forwarded-for", "\u{ff}, 192.0.2.7")], "192.0.2.7", false),
             ("10.0.0.1", &[("x-forwarded-for", "192.0.2.7, 10.2.0.1")], "192.0.2.7", false),
             ("10.0.0.1", &[("x-forwarded-for", "192.0.2.7:99")], "192.0.2.7", false),
             ("10.0.0.1", &[("x-forwarded-for", "192.0.2.7, unknown")], "10.0.0.1", false),
