@@ -6,7 +6,7 @@
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::net::IpAddr;
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -155,8 +155,28 @@ impl AuditLog {
 fn append(path: &Path, entry: &Entry) -> io::Result<()> {
     let mut line = serde_json::to_vec(&Line { time: Timestamp::now(), entry })?;
     line.push(b'\n');
-    // One write, so that lines of several processes do not mix.
-    appendable(path)?.write_all(&line)
+    let mut file = appendable(path)?;
+    if !file.metadata()?.is_file() {
+        return file.write_all(&line);
+    }
+    // Several processes append. The lock ends when the file is closed.
+    file.lock()?;
+    let length = file.metadata()?.len();
+    if !ends_line(path, length) {
+        line.insert(0, b'\n');
+    }
+    file.write_all(&line).inspect_err(|_| {
+        // A full disk may have taken a part of the line. If the part stays, the next line begins with a line feed.
+        let _ = file.set_len(length);
+    })
+}
+
+/// True if the next line can be appended to a file of this length. A file that can't be read is taken to be complete.
+fn ends_line(path: &Path, length: u64) -> bool {
+    let mut last = [b'\n'];
+    let Some(at) = length.checked_sub(1) else { return true };
+    let read = File::open(path).and_then(|file| file.read_exact_at(&mut last, at));
+    read.is_err() || last == [b'\n']
 }
 
 fn appendable(path: &Path) -> io::Result<File> {
@@ -183,6 +203,13 @@ mod tests {
         let line: serde_json::Value = serde_json::from_str(text.lines().next().unwrap()).unwrap();
         assert_eq!((&line["actor"], &line["object"]), (&"command".into(), &"a\nb".into()));
         assert!(line.get("token").is_none() && line["time"].is_string(), "{line}");
+        // A crash may leave a part of a line.
+        std::fs::write(&path, r#"{"time":"2026-"#).unwrap();
+        log.record(&entry);
+        log.record(&entry);
+        let text = std::fs::read_to_string(&path).unwrap();
+        let parsed = text.lines().map(serde_json::from_str::<serde_json::Value>);
+        assert_eq!(parsed.map(|line| line.is_ok()).collect::<Vec<_>>(), [false, true, true]);
         assert!(AuditLog::open(Some(folder.path())).is_err());
     }
 }

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use crate::audit::{Actor, AuditLog, Entry, Outcome};
 use crate::config::ServeArguments;
 use engine::job::Timestamp;
+use formats::DiskTrouble;
 use store::{Expired, Store, StoreError};
 
 /// Time between two foldings of metrics.
@@ -37,10 +38,18 @@ pub(super) async fn maintain(
         if let Err(error) = store.look_at_database().await {
             tracing::error!(%error, "the database can't be checked");
         }
-        if let Err(error) = clean(&store, &settings, &audit).await {
+        let mut cleaned = clean(&store, &settings, &audit).await;
+        if is_full(&cleaned) && matches!(store.give_up_reserve().await, Ok(true)) {
+            cleaned = clean(&store, &settings, &audit).await;
+        }
+        if let Err(error) = cleaned {
             tracing::error!(%error, "cleaning up has failed");
         }
     }
+}
+
+fn is_full(cleaned: &Result<(), StoreError>) -> bool {
+    cleaned.as_ref().is_err_and(|error| error.disk_trouble() == Some(DiskTrouble::Full))
 }
 
 /// Records deletions of one kind, and counts them.
@@ -102,9 +111,9 @@ async fn clean(
         store.remove_jobs(old, settings.low_water_bytes, |job| jobs.record(job)).await?;
     }
     let (uploads, unfinished, jobs) = (uploads.count, unfinished.count, jobs.count);
-    // 4. Keep a reserve, so that the service can start on a full disk.
+    // 4. Keep a reserve, so that the service can start and delete on a full disk.
     if let Err(error) = store.dir().keep_reserve(settings.min_free_bytes) {
-        tracing::warn!(%error, "there is no reserve for a start on a full disk");
+        tracing::warn!(%error, "there is no reserve for a full disk");
     }
     if orphans + uploads + unfinished + jobs > 0 {
         tracing::info!(orphans, uploads, unfinished, jobs, "cleaned up");

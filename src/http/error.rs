@@ -266,6 +266,12 @@ impl From<StoreError> for ApiError {
             }
             StoreError::Damaged { .. } => Code::FileDamaged,
             StoreError::Interrupted | StoreError::Restless(_) => Code::Unavailable,
+            StoreError::DatabaseGone(_) => {
+                tracing::error!(%error, "a change is refused");
+                let detail = "the database of the service was removed or replaced, so nothing is changed: its \
+                              administrator must restore it";
+                return Self::new(Code::Unavailable, detail);
+            }
             busy if busy.is_busy() => {
                 tracing::warn!(%error, "the database is busy");
                 let detail = "the database is busy and nothing was changed; try again";

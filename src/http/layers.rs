@@ -4,8 +4,9 @@ use std::any::Any;
 use std::convert::Infallible;
 use std::time::Instant;
 
-use axum::extract::{MatchedPath, OriginalUri, Request};
-use axum::http::{HeaderName, HeaderValue, Method, Version, header};
+use axum::body::Body;
+use axum::extract::{MatchedPath, OriginalUri, Request, State};
+use axum::http::{HeaderName, HeaderValue, Method, StatusCode, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use tower::{Layer, Service, ServiceExt, service_fn};
@@ -18,6 +19,7 @@ use super::access::Admitted;
 use super::context::relative;
 use super::error::{ApiError, Code, REQUEST_ID};
 use super::metrics;
+use store::Store;
 
 const HEADER: HeaderName = HeaderName::from_static("x-request-id");
 
@@ -182,6 +184,28 @@ pub(super) async fn close_after_refusal(mut response: Response) -> Response {
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
     }
     response
+}
+
+/// Repeats a deletion that a full disk prevented, once the reserve is given up.
+pub(super) async fn delete_with_reserve(
+    State(store): State<Store>,
+    request: Request,
+    next: Next,
+) -> Response {
+    if request.method() != Method::DELETE {
+        return next.run(request).await;
+    }
+    let (parts, body) = request.into_parts();
+    let again = Request::from_parts(parts.clone(), Body::empty());
+    let response = next.clone().run(Request::from_parts(parts, body)).await;
+    if response.status() != StatusCode::INSUFFICIENT_STORAGE {
+        return response;
+    }
+    match store.give_up_reserve().await {
+        Ok(true) => next.run(again).await,
+        Ok(false) => response,
+        Err(error) => ApiError::from(error).into_response(),
+    }
 }
 
 /// The answer to a request whose handler panicked.

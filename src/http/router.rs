@@ -110,8 +110,9 @@ pub fn router(app: App) -> Router {
             from_fn_with_state((store, sites.clone(), revocations, route.rule), access::guard);
         let handlers =
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
+        let reserve = from_fn_with_state(app.store.clone(), layers::delete_with_reserve);
         let record = from_fn_with_state((app.audit.clone(), route.path), audit::record);
-        let handlers = handlers.route_layer(guard);
+        let handlers = handlers.route_layer(reserve).route_layer(guard);
         let handlers = if route.is_pure { handlers } else { handlers.route_layer(record) };
         let handlers = if route.uploads { handlers.layer(close.clone()) } else { handlers };
         router = router.route(route.path, handlers);

@@ -191,6 +191,10 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
 
 async fn database_answers(app: &App) -> Result<(), String> {
     app.store.ping().await.map_err(|_| "the database does not answer".to_owned())?;
+    app.store.check_database_file().map_err(|_| {
+        "its file was removed or replaced: stop the service, and restore the file or a backup"
+            .to_owned()
+    })?;
     app.store.database_damage().map_or(Ok(()), |_| {
         Err("the database is damaged; the log says where: restore a backup".to_owned())
     })

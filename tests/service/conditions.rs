@@ -163,6 +163,35 @@ async fn readiness_is_tested_by_writing() {
 }
 
 #[tokio::test]
+async fn changes_are_refused_while_the_database_is_missing_or_another() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    app.get_until("/readyz", 200).await;
+    let aside = app.data().join("tmp");
+    let names = ["sci-recon.db", "sci-recon.db-wal", "sci-recon.db-shm"];
+    let refused = async || {
+        let ready = app.get_until("/readyz", 503).await.json();
+        assert!(ready["database"].as_str().unwrap().contains("removed or replaced"), "{ready}");
+        let upload = app.request(Method::POST, "/v1/blobs").body("important");
+        app.send(upload).await.problem(503, "unavailable");
+        let begin = app.request(Method::POST, "/v1/uploads").header("tus-resumable", "1.0.0");
+        app.send(begin.header("upload-length", 10)).await.problem(503, "unavailable");
+    };
+    for name in names {
+        std::fs::rename(app.data().join(name), aside.join(name)).unwrap();
+    }
+    refused().await;
+    for name in names {
+        std::fs::copy(aside.join(name), app.data().join(name)).unwrap();
+    }
+    refused().await;
+    for name in names {
+        std::fs::rename(aside.join(name), app.data().join(name)).unwrap();
+    }
+    app.get_until("/readyz", 200).await;
+    app.upload(b"important".to_vec()).await;
+}
+
+#[tokio::test]
 async fn a_corrected_clock_deletes_no_recent_upload() {
     let shim = Shim::build();
     let clock = shim.file("clock");

@@ -250,9 +250,55 @@ impl Drop for SmallDisk {
     }
 }
 
+fn fill(file: &Path) {
+    use std::io::Write;
+    let mut file = std::fs::File::create(file).unwrap();
+    while file.write_all(&[1; 4096]).is_ok() {}
+}
+
+/// The reserve file, once it is made.
+async fn reserve(app: &TestApp) -> PathBuf {
+    let reserve = app.data().join("reserve");
+    let start = std::time::Instant::now();
+    while !reserve.exists() {
+        assert!(start.elapsed().as_secs() < 30, "no reserve is made");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    reserve
+}
+
+#[tokio::test]
+async fn a_disk_that_fills_takes_deletions_and_leaves_no_half_line_in_the_audit_log() {
+    let Some(disk) = SmallDisk::mount("size=160m") else {
+        return crate::app::skip("a file system can't be mounted: run the test as root");
+    };
+    let folder = tempfile::tempdir_in(disk.0.path()).unwrap();
+    let [filling, audit] = ["filling", "audit.jsonl"].map(|name| disk.0.path().join(name));
+    let arguments = ["--workers", "1", "--audit-log", audit.to_str().unwrap()];
+    let app = TestApp::on(folder, "data", &arguments).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&small(&measurement)).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let (reserve, path) = (reserve(&app).await, format!("/v1/jobs/{job}"));
+    fill(&filling);
+    // The lines of more than a page.
+    for _ in 0..40 {
+        let rename = app.request(reqwest::Method::PATCH, &path);
+        rename.json(&json!({"label": "x"})).send().await.unwrap();
+    }
+    app.delete(&path).await.expect(204);
+    assert!(!reserve.exists());
+    app.get(&path).await.problem(404, "not_found");
+    std::fs::remove_file(&filling).unwrap();
+    app.upload(b"abc".to_vec()).await;
+    let lines = std::fs::read_to_string(&audit).unwrap();
+    let lines = lines.lines().map(|line| serde_json::from_str(line).expect(line));
+    let lines: Vec<Value> = lines.collect();
+    assert_eq!(lines.last().unwrap()["action"], "POST /v1/blobs");
+}
+
 #[tokio::test]
 async fn a_service_starts_on_a_full_disk_and_deletes() {
-    use std::io::Write;
     let Some(disk) = SmallDisk::mount("size=160m") else {
         return crate::app::skip("a file system can't be mounted: run the test as root");
     };
@@ -262,16 +308,9 @@ async fn a_service_starts_on_a_full_disk_and_deletes() {
     let (_, measurement) = app.scene(&Scene::SMALL).await;
     let job = app.submit(&small(&measurement)).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    let reserve = app.data().join("reserve");
-    let start = std::time::Instant::now();
-    while !reserve.exists() {
-        assert!(start.elapsed().as_secs() < 30, "no reserve is made");
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
+    let reserve = reserve(&app).await;
     app.kill();
-    let mut file = std::fs::File::create(&filling).unwrap();
-    while file.write_all(&[1; 4096]).is_ok() {}
-    drop(file);
+    fill(&filling);
     assert!(app.try_restart(), "the service starts");
     assert!(!reserve.exists());
     app.delete(&format!("/v1/jobs/{job}")).await.expect(204);

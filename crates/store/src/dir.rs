@@ -36,7 +36,7 @@ const RESERVE_BYTES: u64 = 32 << 20;
 /// before-updates/       copies of the database from before updates of the program
 /// before-updates/kept/  files that were deleted in the days after an update, for a return to such a copy
 /// tmp/                  files that are being written, locked by their writers
-/// reserve               empty room for a start on a full disk
+/// reserve               empty room for a start and for deletions on a full disk
 /// ```
 #[derive(Debug, Clone)]
 pub struct DataDir {
@@ -158,12 +158,21 @@ impl DataDir {
         self.root.join("reserve")
     }
 
-    /// Removes the reserve file if the disk is full, so that a service can start and delete. True if it did.
+    /// True if a start needs the reserve.
+    pub(crate) fn is_full(&self) -> Result<bool> {
+        Ok(self.disk()?.0 < RESERVE_BYTES / 4)
+    }
+
+    /// Removes the reserve file, so that a service with a full disk can start and delete. True if there was one.
     pub(crate) fn give_up_reserve(&self) -> Result<bool> {
-        if self.disk()?.0 >= RESERVE_BYTES / 4 || !self.reserve().exists() {
-            return Ok(false);
+        let exists = self.reserve().exists();
+        remove(&self.reserve())?;
+        if exists {
+            tracing::warn!(
+                "the disk is full: its reserve is given up, so that jobs and files can be deleted"
+            );
         }
-        remove(&self.reserve()).map(|()| true)
+        Ok(exists)
     }
 
     /// Makes the reserve file, if it is missing and the disk has room for it and for `min_free` more bytes.

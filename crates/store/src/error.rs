@@ -49,6 +49,13 @@ pub enum StoreError {
     Taken(PathBuf),
     #[error("{folder}: {found}. Nothing was changed. To go on, {remedy}", folder = folder.display())]
     Refused { folder: PathBuf, found: String, remedy: &'static str },
+    /// Changes of the open database would be lost.
+    #[error(
+        "{path} was removed or replaced while the service runs, so nothing is changed: stop the service, and put the \
+         database back with its -wal file, or serve a backup",
+        path = .0.display()
+    )]
+    DatabaseGone(PathBuf),
     #[error("there is no {what} {id}")]
     NotFound { what: &'static str, id: String },
     #[error("{}", unready(*.id, .error.as_deref()))]

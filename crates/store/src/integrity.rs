@@ -124,7 +124,7 @@ impl Store {
                 [now, job, snapshot, name, record.sha256]
             ),
         };
-        if marked.execute(&self.writer).await?.rows_affected() > 0 {
+        if marked.execute(self.writer()?).await?.rows_affected() > 0 {
             let file = record.name(self.dir());
             tracing::error!(
                 file,
@@ -219,7 +219,7 @@ impl Store {
     async fn scrub_page(&self, rate: u64) -> Result<Duration> {
         let now = Timestamp::now();
         sql!("INSERT INTO scrub (one, started_at) VALUES (1, ?) ON CONFLICT DO NOTHING", [now])
-            .execute(&self.writer)
+            .execute(self.writer()?)
             .await?;
         let row: (Timestamp, Option<crate::columns::Json<Place>>) =
             sql_as!("SELECT started_at, place FROM scrub").fetch_one(&self.readers).await?;
@@ -233,7 +233,7 @@ impl Store {
                 return Ok(left.min(PAUSE));
             }
             sql!("UPDATE scrub SET started_at = ?, place = NULL", [now])
-                .execute(&self.writer)
+                .execute(self.writer()?)
                 .await?;
             return Ok(PAUSE);
         };
@@ -241,7 +241,7 @@ impl Store {
             self.scrub_file(record, rate).await?;
         }
         sql!("UPDATE scrub SET place = ?", [crate::columns::Json(&last.place)])
-            .execute(&self.writer)
+            .execute(self.writer()?)
             .await?;
         Ok(Duration::ZERO)
     }

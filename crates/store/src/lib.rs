@@ -17,6 +17,7 @@ mod backup;
 mod cleaning;
 mod clock;
 mod columns;
+mod database_file;
 mod deletion;
 mod dir;
 mod error;
@@ -84,6 +85,8 @@ pub struct Store {
     /// Hashes of files that were read before they were handed out.
     hashes: Arc<hashes::Hashes>,
     removals: removal::Removals,
+    /// The files of the open database.
+    files: database_file::DatabaseFiles,
     /// Damage of the database that the last check found.
     damage: Arc<Mutex<Option<String>>>,
     /// The number of the newest migration.
@@ -108,10 +111,8 @@ impl Store {
         let serves = purpose != Purpose::Use;
         let dir = if serves { DataDir::create(root)? } else { DataDir::find(root)? };
         let server = if serves { Some(Arc::new(dir.lock_server()?)) } else { None };
-        if serves && dir.give_up_reserve()? {
-            tracing::warn!(
-                "the disk is full: its reserve is given up, so that jobs and files can be deleted"
-            );
+        if serves && dir.is_full()? {
+            dir.give_up_reserve()?;
         }
         identity::check(&dir, purpose, schema.newest()).await?;
         dir.fill()?;
@@ -139,6 +140,9 @@ impl Store {
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         let writer = writer.await?;
+        // A connection that is made later must not make the database anew where its file is missing.
+        let options = options.create_if_missing(false);
+        writer.set_connect_options(options.clone());
         schema.apply(&writer).await.map_err(|error| match copy {
             Some(copy) => StoreError::Upgrade { error, copy },
             None => error.into(),
@@ -149,6 +153,7 @@ impl Store {
             .max_lifetime(None)
             .connect_with(options.read_only(true))
             .await?;
+        let files = database_file::DatabaseFiles::open(&dir.database())?;
         let store = Self {
             dir,
             writer,
@@ -156,6 +161,7 @@ impl Store {
             forecasts: Arc::default(),
             hashes: Arc::default(),
             removals: removal::Removals::default(),
+            files,
             damage: Arc::default(),
             schema: schema.newest(),
             _server: server,
@@ -167,7 +173,7 @@ impl Store {
                 }
             }
             store.note_time(Duration::ZERO).await?;
-            identity::settle(&store.dir, &mut *store.writer.acquire().await?).await?;
+            identity::settle(&store.dir, &mut *store.writer()?.acquire().await?).await?;
             store.write_marker().await?;
             if purpose == (Purpose::Serve { accept_database: true }) {
                 store.recount_totals().await?;
@@ -179,12 +185,12 @@ impl Store {
 
     /// Lets the database and the marker be newer than all copies of them; see `identity.rs`.
     pub async fn advance_generation(&self) -> Result<()> {
-        sql!("UPDATE folder SET generation = generation + 1").execute(&self.writer).await?;
+        sql!("UPDATE folder SET generation = generation + 1").execute(self.writer()?).await?;
         self.write_marker().await
     }
 
     async fn write_marker(&self) -> Result<()> {
-        let marker = identity::marker(&mut *self.writer.acquire().await?, self.schema).await?;
+        let marker = identity::marker(&mut *self.writer()?.acquire().await?, self.schema).await?;
         let (root, draft) = (self.dir.root().to_owned(), self.temporary_path());
         on_files(move || identity::write(&root, &draft, &marker)).await
     }
@@ -198,6 +204,12 @@ impl Store {
         self.removals.finished().await;
         self.readers.close().await;
         self.writer.close().await;
+    }
+
+    /// Gives up the reserve of a full disk, so that a deletion can be tried again. False if there is none.
+    pub async fn give_up_reserve(&self) -> Result<bool> {
+        let dir = self.dir.clone();
+        on_files(move || dir.give_up_reserve()).await
     }
 
     /// Asks the database for an answer.
@@ -235,7 +247,19 @@ impl Store {
         .await
     }
 
+    /// Errors: [`StoreError::DatabaseGone`] if the file of the database was removed or replaced since it was opened.
+    pub fn check_database_file(&self) -> Result<()> {
+        self.files.check(&self.dir.database())
+    }
+
+    /// The connection for changes. Changes of a removed file would be lost, so they are refused.
+    /// Errors: [`StoreError::DatabaseGone`].
+    pub(crate) fn writer(&self) -> Result<&SqlitePool> {
+        self.check_database_file()?;
+        Ok(&self.writer)
+    }
+
     pub(crate) async fn write(&self) -> Result<WriteTransaction> {
-        Ok(self.writer.begin_with("BEGIN IMMEDIATE").await?)
+        Ok(self.writer()?.begin_with("BEGIN IMMEDIATE").await?)
     }
 }

@@ -174,7 +174,7 @@ impl Store {
             "UPDATE remote_tasks SET stream = ?, seq = ? WHERE task = ? AND attempt = ?",
             [stream, seq, lease.task, lease.attempt]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         Ok(())
     }
@@ -313,7 +313,7 @@ impl Store {
 
     /// Removes a worker on another machine that has left.
     pub async fn remote_worker_left(&self, id: WorkerId) -> Result<(), StoreError> {
-        workers::remove(&mut *self.writer.acquire().await?, id).await
+        workers::remove(&mut *self.writer()?.acquire().await?, id).await
     }
 }
 

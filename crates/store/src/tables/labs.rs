@@ -168,7 +168,7 @@ impl Store {
              SET max_bytes = excluded.max_bytes, max_jobs = excluded.max_jobs",
             [max_bytes, max_jobs]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         Ok(())
     }

@@ -272,7 +272,7 @@ impl Store {
             "UPDATE partials SET received = ?, expires_at = ? WHERE id = ? AND received = ?",
             [received, expires_at, upload.id, upload.received]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         if changed.rows_affected() == 0 {
             return Err(StoreError::missing("upload", upload.id));
@@ -325,7 +325,7 @@ impl Store {
 
     /// Removes the row and the file, whose lock must be held.
     async fn end_partial(&self, id: PartialId) -> Result<()> {
-        sql!("DELETE FROM partials WHERE id = ?", [id]).execute(&self.writer).await?;
+        sql!("DELETE FROM partials WHERE id = ?", [id]).execute(self.writer()?).await?;
         self.discard(self.dir().partial(id), None).await
     }
 

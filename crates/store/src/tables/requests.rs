@@ -157,7 +157,7 @@ impl Store {
     pub async fn drop_refused(&self, id: impl Into<ThingId>) -> Result<bool> {
         let dropped = "DELETE FROM requests WHERE id = ?1 AND refusal IS NOT NULL
                        AND NOT EXISTS (SELECT 1 FROM tasks WHERE thing = ?1 AND kind = 'calibration')";
-        let dropped = sql!(dropped, [id.into()]).execute(&self.writer).await?;
+        let dropped = sql!(dropped, [id.into()]).execute(self.writer()?).await?;
         Ok(dropped.rows_affected() > 0)
     }
 }

@@ -137,7 +137,9 @@ impl Store {
 
     /// Ends a session. One that has ended already is no error.
     pub async fn end_session(&self, secret: &Secret) -> Result<()> {
-        sql!("DELETE FROM sessions WHERE hash = ?", [secret.hash()]).execute(&self.writer).await?;
+        sql!("DELETE FROM sessions WHERE hash = ?", [secret.hash()])
+            .execute(self.writer()?)
+            .await?;
         Ok(())
     }
 
@@ -147,7 +149,7 @@ impl Store {
             "UPDATE tokens SET used_at = ?1 WHERE id = ?2 AND (used_at IS NULL OR used_at <= ?3)",
             [Timestamp::now(), id, noted_before()]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         Ok(())
     }
@@ -170,7 +172,7 @@ impl Store {
             "UPDATE tokens SET revoked_at = coalesce(revoked_at, ?) WHERE id = ?",
             [Timestamp::now(), id]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         if changed.rows_affected() == 0 {
             return Err(StoreError::missing("token", id));

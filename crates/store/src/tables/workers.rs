@@ -86,14 +86,14 @@ impl Store {
                 takes == WorkerTakes::All
             ]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         Ok(())
     }
 
     /// Records that a worker lives though it has no task; a heartbeat says the same of one that has.
     pub async fn worker_seen(&self, id: WorkerId) -> Result<()> {
-        seen(&mut *self.writer.acquire().await?, id).await
+        seen(&mut *self.writer()?.acquire().await?, id).await
     }
 
     /// The workers that gave a sign of life within `age`, except the light one: it adds nothing to the speed of jobs.
@@ -133,7 +133,7 @@ impl Store {
 
     /// Forgets the workers that gave no sign of life within `age`: nobody saw their end.
     pub async fn forget_workers(&self, age: Duration) -> Result<()> {
-        sql!("DELETE FROM workers WHERE seen_at < ?", [since(age)]).execute(&self.writer).await?;
+        sql!("DELETE FROM workers WHERE seen_at < ?", [since(age)]).execute(self.writer()?).await?;
         Ok(())
     }
 }
