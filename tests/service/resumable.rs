@@ -63,6 +63,8 @@ async fn pieces_are_joined_to_a_blob() {
     app.send(piece(&app, &path, 1, b"bcd")).await.problem(413, "too_large");
     let last = app.send(piece(&app, &path, 1, b"bc")).await.expect(204);
     assert_eq!(last.header("content-location"), format!("/v1/blobs/{ABC}"));
+    app.send(piece(&app, &path, 3, b"d")).await.problem(413, "too_large");
+    app.send(piece(&app, &path, 3, b"")).await.expect(204);
     let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
     assert_eq!(known.header("upload-length"), "3");
     assert!(known.header("upload-metadata").starts_with("filename YQ==,"));
@@ -448,4 +450,51 @@ async fn bytes_before_a_disconnect_are_kept() {
         assert!(start.elapsed().as_secs() < 10, "{}", offset(&app, &path).await);
         tokio::time::sleep(std::time::Duration::from_millis(20)).await;
     }
+}
+
+/// A piece that is not complete: the connection stays open after these bytes.
+async fn open_piece(app: &TestApp, path: &str, offset: usize, bytes: usize) -> TcpStream {
+    let address = app.address();
+    let mut socket = TcpStream::connect(&address).await.unwrap();
+    let head = format!(
+        "PATCH {path} HTTP/1.1\r\nHost: {address}\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: {offset}\r\n\
+         Content-Type: application/offset+octet-stream\r\nContent-Length: {}\r\n\r\n",
+        1_000_000 - offset
+    );
+    socket.write_all(head.as_bytes()).await.unwrap();
+    socket.write_all(&vec![7; bytes]).await.unwrap();
+    let file = app.data().join("partial").join(path.rsplit('/').next().unwrap());
+    let start = std::time::Instant::now();
+    while std::fs::metadata(&file).map_or(0, |file| file.len()) < (offset + bytes) as u64 {
+        assert!(start.elapsed().as_secs() < 20, "the bytes do not arrive");
+        tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+    }
+    socket
+}
+
+/// The client sends its file as one piece, as most do by default.
+#[tokio::test]
+async fn a_stop_and_a_crash_keep_the_received_part_of_a_piece() {
+    let mut app = TestApp::start().await;
+    let path = begin(&app, 1_000_000, "").await;
+    let mut cut = open_piece(&app, &path, 0, 300_000).await;
+    let start = std::time::Instant::now();
+    assert!(app.stop().success());
+    let seconds = start.elapsed().as_secs_f64();
+    assert!(seconds < 15.0, "the stop waited {seconds} s for the upload");
+    let mut answer = String::new();
+    cut.read_to_string(&mut answer).await.unwrap();
+    assert!(answer.starts_with("HTTP/1.1 503 "), "{answer}");
+    app.restart();
+    assert_eq!(offset(&app, &path).await, "300000");
+    let _open = open_piece(&app, &path, 300_000, 300_000).await;
+    let start = std::time::Instant::now();
+    while offset(&app, &path).await != "600000" {
+        assert!(start.elapsed().as_secs() < 20, "{}", offset(&app, &path).await);
+        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+    }
+    app.restart();
+    assert_eq!(offset(&app, &path).await, "600000");
+    let rest = piece(&app, &path, 600_000, &[7; 400_000]);
+    assert!(!app.send(rest).await.expect(204).header("content-location").is_empty());
 }

@@ -278,7 +278,10 @@ async fn receive_piece(
         );
         return Err(ApiError::new(Code::OffsetMismatch, detail));
     }
-    let Some(file) = file else { return Ok(upload) };
+    let Some(file) = file else {
+        append::expect_no_bytes(app, upload.facts.length, body).await?;
+        return Ok(upload);
+    };
     // Without Content-Length, space is reserved while the bytes arrive.
     let length = text(headers, &header::CONTENT_LENGTH)?.and_then(|text| text.parse().ok());
     let length: u64 = length.unwrap_or_default();
