@@ -1,5 +1,6 @@
 //! Members of archives: their position, and their decompressed content.
 
+use std::collections::HashSet;
 use std::fs::File;
 use std::io::{self, BufReader, ErrorKind, Read};
 use std::os::unix::fs::FileExt;
@@ -60,6 +61,19 @@ impl Member {
             });
         }
         Ok(self)
+    }
+}
+
+/// Refuses members of the same name: programs differ in which of them they read.
+pub(super) fn distinct(members: Vec<Member>, format: Format) -> Result<Vec<Member>> {
+    let mut names = HashSet::new();
+    match members.iter().find(|member| !names.insert(member.name.as_str())) {
+        None => Ok(members),
+        Some(member) => {
+            let name = quoted(&member.name);
+            let problem = format!("two members have the name {name}: make the archive anew");
+            Err(FormatError::malformed(format, problem))
+        }
     }
 }
 

@@ -6,7 +6,7 @@
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 
-use super::member::{Member, Packing, quoted};
+use super::member::{Member, Packing, distinct, quoted};
 use super::{Format, FormatError};
 use crate::error::Result;
 
@@ -19,7 +19,8 @@ const MAX_MEMBERS: usize = 16_384;
 /// Longest name that is stored in a separate member.
 const MAX_NAME_BYTES: u64 = 1 << 16;
 
-/// Returns all members that are regular files. Errors: a damaged header; members outside the file; sparse files.
+/// Returns all members that are regular files. Errors: a damaged header; members outside the file, or of one
+/// name; sparse files.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     let (mut offset, mut members, mut count) = (0, Vec::new(), 0);
     let mut long_name = None;
@@ -58,7 +59,7 @@ pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
             }
         }
     }
-    Ok(members)
+    distinct(members, Format::Tar)
 }
 
 /// The name in a header, including folders.

@@ -6,7 +6,7 @@
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 
-use super::member::{Member, Packing, quoted};
+use super::member::{Member, Packing, distinct, quoted};
 use super::{Format, FormatError};
 use crate::error::Result;
 
@@ -35,7 +35,7 @@ struct Directory {
 }
 
 /// Returns all members except folders. Errors: a damaged or too long directory; encrypted members, or ones compressed
-/// by another method than Deflate; members outside the file, or longer than Deflate can expand.
+/// by another method than Deflate; members outside the file, longer than Deflate can expand, or of one name.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     let directory = directory(file, length)?;
     if directory.bytes > MAX_DIRECTORY_BYTES {
@@ -63,7 +63,7 @@ pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
             members.push(member(file, length, name, (head, extra))?);
         }
     }
-    Ok(members)
+    distinct(members, Format::Zip)
 }
 
 /// Finds the directory by its end record, from the end of the file.

@@ -64,6 +64,24 @@ fn arrays_are_read_by_name() {
 }
 
 #[test]
+fn two_arrays_of_one_name_are_refused() {
+    let [stored, _] = options();
+    let (one, other) = (array(&ramp((3, 4, 5), 2)), array(&ramp((3, 4, 5), 1000)));
+    // The crate does not write such archives.
+    let mut bytes = archive(&[("mask.npy", one), ("musk.npy", other)], stored);
+    for at in 0..bytes.len() - 8 {
+        if &bytes[at..at + 8] == b"musk.npy" {
+            bytes[at + 1] = b'a';
+        }
+    }
+    for name in [None, Some("mask")] {
+        let error = read(&bytes, SceneArray::Masks, name).unwrap_err();
+        assert!(matches!(error, FormatError::Malformed { .. }), "{error}");
+        assert_names(&error.to_string(), &["two members", "'mask.npy'"]);
+    }
+}
+
+#[test]
 fn damage_is_detected() {
     for options in options() {
         let bytes = archive(&[("mask.npy", array(&ramp((3, 4, 5), 251)))], options);
