@@ -74,7 +74,7 @@ pub enum FormatError {
     /// A value is NaN or infinite.
     #[error(
         "{subject}: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}; all values \
-         must be finite"
+         must be finite, and at most 3.4e38"
     )]
     NotFinite { subject: &'static str, value: f32, frame: usize, row: usize, column: usize },
     /// A mask value exceeds the full scale.
@@ -99,11 +99,33 @@ pub enum FormatError {
         "masks: frame {frame} of {frames} (counted from 0) has no value above 0; every mask needs open pixels"
     )]
     MaskFrameZero { frame: usize, frames: usize },
-    /// A snapshot is zero everywhere.
+    /// A value can't be represented after the division by the full scale.
     #[error(
-        "measurement: snapshot {snapshot} of {snapshots} (counted from 0) is zero everywhere: there is nothing to reconstruct"
+        "measurement: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}, which can't be \
+         represented after the division by the full scale {full_scale}: state as `full_scale` the stored value that means 1"
     )]
-    SnapshotZero { snapshot: usize, snapshots: usize },
+    Overflow { value: f32, frame: usize, row: usize, column: usize, full_scale: f32 },
+    /// No snapshot has light.
+    #[error(
+        "measurement: snapshot {snapshot} of {snapshots} (counted from 0) {state}: there is nothing to reconstruct"
+    )]
+    NoLight { snapshot: usize, snapshots: usize, state: Lightless },
+}
+
+/// The state of a snapshot without light.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display)]
+pub enum Lightless {
+    /// All stored values are 0.
+    #[strum(to_string = "is zero everywhere")]
+    Zero,
+    /// All values are NaN.
+    #[strum(to_string = "has no finite value: all pixels are NaN, or left out for their masks")]
+    NotMeasured,
+    /// All values become 0.
+    #[strum(
+        to_string = "is zero everywhere after the division by the full scale, which is too large"
+    )]
+    Underflow,
 }
 
 /// A state of the disk that ends without anybody changing the data: work waits for it.
@@ -144,12 +166,12 @@ impl FormatError {
             Self::NoAxes(_) => "no_axes",
             Self::Part { .. } => "invalid_part",
             Self::FullScale(_) | Self::FullScaleNeeded(_) => "invalid_full_scale",
-            Self::NotFinite { .. } => "not_finite",
+            Self::NotFinite { .. } | Self::Overflow { .. } => "not_finite",
             Self::AboveFullScale { .. } => "above_full_scale",
             Self::BipolarMasks { .. } => "bipolar_masks",
             Self::AllMasksZero { .. } => "all_masks_zero",
             Self::MaskFrameZero { .. } => "mask_frame_zero",
-            Self::SnapshotZero { .. } => "snapshot_zero",
+            Self::NoLight { .. } => "snapshot_zero",
         }
     }
 

@@ -46,7 +46,7 @@ pub mod validate;
 pub use axes::{Axes, Expected};
 pub use channels::Channels;
 pub use colour::open_colours;
-pub use error::{DiskTrouble, FormatError};
+pub use error::{DiskTrouble, FormatError, Lightless};
 pub use format::Format;
 pub use limits::Limits;
 pub use natural::natural_key;

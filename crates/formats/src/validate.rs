@@ -4,7 +4,7 @@
 use ndarray::{Array2, ArrayView2};
 
 use super::{FormatError, FrameReader, FullScale, StackInfo};
-use crate::error::Result;
+use crate::error::{Lightless, Result};
 
 /// Masks may exceed 1 by this much, due to rounding in their normalisation. Such values are set to 1.
 const TOLERANCE: f32 = 1e-6;
@@ -166,41 +166,51 @@ impl Side {
 }
 
 /// Reads all snapshots, and passes each one (row, column) divided by the full scale to `sink`. Values may have any
-/// sign; NaN are not measured and stay NaN. Returns the snapshots that are 0 everywhere.
+/// sign; NaN are not measured and stay NaN. Returns the snapshots without light.
 ///
-/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::SnapshotZero`] if all are 0.
-/// After an error the output of the sink is invalid.
+/// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::Overflow`];
+/// [`FormatError::NoLight`] if no snapshot has light. After an error the output of the sink is invalid.
 pub fn check_snapshots(
     reader: &mut dyn FrameReader,
     full_scale: FullScale,
     mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<()>,
-) -> Result<Vec<usize>> {
+) -> Result<Vec<(usize, Lightless)>> {
     let (info, scale) = (*reader.info(), full_scale.value());
-    let (mut snapshots, mut zero) = (0, Vec::new());
+    let (mut snapshots, mut dark) = (0, Vec::new());
     while let Some(mut snapshot) = reader.next_frame()? {
         check_size(&info, snapshots, &snapshot)?;
-        let mut has_signal = false;
+        // What the snapshot is as long as no pixel has light.
+        let (mut has_light, mut state) = (false, Lightless::NotMeasured);
         for ((row, column), value) in snapshot.indexed_iter_mut() {
             let scaled = *value / scale;
-            // A small full scale may turn a finite value into an infinity.
-            if scaled.is_infinite() {
+            if value.is_infinite() {
                 return Err(not_finite("measurement", *value, snapshots, row, column));
             }
-            has_signal |= scaled != 0.0 && !scaled.is_nan();
+            if scaled.is_infinite() {
+                let (value, frame, full_scale) = (*value, snapshots, scale);
+                return Err(FormatError::Overflow { value, frame, row, column, full_scale });
+            }
+            has_light |= scaled != 0.0 && !scaled.is_nan();
+            state = match state {
+                _ if value.is_nan() => state,
+                _ if *value != 0.0 => Lightless::Underflow,
+                Lightless::NotMeasured => Lightless::Zero,
+                state => state,
+            };
             *value = scaled;
         }
-        if !has_signal {
-            zero.push(snapshots);
+        if !has_light {
+            dark.push((snapshots, state));
         }
         snapshots += 1;
         sink(snapshot.view())?;
     }
     check_count(info.frames, snapshots)?;
-    match zero.first() {
-        Some(&snapshot) if zero.len() == snapshots => {
-            Err(FormatError::SnapshotZero { snapshot, snapshots })
+    match dark.first() {
+        Some(&(snapshot, state)) if dark.len() == snapshots => {
+            Err(FormatError::NoLight { snapshot, snapshots, state })
         }
-        _ => Ok(zero),
+        _ => Ok(dark),
     }
 }
 

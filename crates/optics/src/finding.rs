@@ -269,7 +269,7 @@ impl FindingCode {
                 &[Measurement],
                 Warning,
                 Warning,
-                "a snapshot is 0 everywhere",
+                "a snapshot is 0 everywhere, or has no finite value",
                 "check the trigger of the camera; the frames of this snapshot are black",
             ),
             Self::LeftAligned => (

@@ -45,6 +45,9 @@ const PLAUSIBLE_BRIGHTNESS: RangeInclusive<f64> = 0.12..=1.1;
 const BRIGHTEST: f64 = 0.99;
 /// A snapshot is a copy of a mask if it has no light of other masks, and if that mask explains this share.
 const COPY: f64 = 0.95;
+/// A snapshot is flat if its pixels differ from the mean of their block by less than this share of the mean of the
+/// measurement. Values with single precision have that rounding error.
+const FLAT: f64 = 1e-6;
 /// Side, in pixels, of the blocks in which the scene is assumed to be uniform.
 pub(super) const BLOCK: usize = 8;
 /// Number of reweighted fits. At 128x128 pixels they reduce its standard error from 0.8 % to 0.35 % of
@@ -133,6 +136,8 @@ pub struct MeasurementFigures {
     pub drift: [Drift; 2],
     /// Brightness of the brightest parts of the scene.
     pub brightest: f64,
+    /// True if the measurement has no fine structure, so that no fit was possible.
+    pub is_flat: bool,
 }
 
 /// Comparison of the masks with those displaced by one pixel to and fro along an axis, by the square roots of the shares
@@ -208,17 +213,25 @@ impl MeasurementStudy {
         }
     }
 
-    /// Returns the statistics; `None` if all windows were too small or have no structure.
+    /// Returns the statistics; `None` if all windows were too small, the masks have no structure, or the measurement is 0.
     pub fn finish(self) -> Option<MeasurementFigures> {
-        if self.pixels == 0.0 || self.energy <= 0.0 {
+        if self.pixels == 0.0 {
             return None;
         }
         let equal_weights: Vec<Array1<f64>> =
             self.strips.iter().map(|strip| Array1::ones(strip.y_means.len())).collect();
-        let fit = Fit::new(&self.strips, &equal_weights)?;
+        let fit = Fit::new(&self.strips, &equal_weights);
         let mean = self.strips.iter().map(|strip| strip.y_means.sum()).sum::<f64>()
             * (BLOCK * BLOCK) as f64
             / self.pixels;
+        let limit = -NEGATIVE_SHARE * mean.abs();
+        let negative_blocks =
+            self.negative_means.iter().filter(|block| f64::from(**block) < limit).count();
+        let negative_area = (negative_blocks * BLOCK * BLOCK) as f64 / self.pixels;
+        if self.energy <= self.pixels * (FLAT * mean).powi(2) {
+            return (mean != 0.0).then(|| self.flat(mean, negative_area, fit.is_some()));
+        }
+        let fit = fit?;
         let explained = |correlations: &Array1<f64>| {
             correlations.dot(&fit.inverse.dot(correlations)) / self.energy
         };
@@ -228,10 +241,6 @@ impl MeasurementStudy {
             .max_by(|a, b| a.1.total_cmp(&b.1))?;
         let unshifted = explained(&self.correlations[REACH * (2 * REACH + 1) + REACH]);
         let gain = explained_shifted - unshifted;
-        let limit = -NEGATIVE_SHARE * mean.abs();
-        let negative_blocks =
-            self.negative_means.iter().filter(|block| f64::from(**block) < limit).count();
-        let negative_area = (negative_blocks * BLOCK * BLOCK) as f64 / self.pixels;
         let pixels_from_centre = |index: usize| REACH as i32 - index as i32;
         let mosaic = phase_difference(&self.strips, &fit.brightness, mean);
         let local_mosaic = local_phase_difference(&self.strips, &fit.brightness);
@@ -259,6 +268,7 @@ impl MeasurementStudy {
             local_mosaic,
             drift,
             brightest: brightest(&self.strips, weighted.offset),
+            is_flat: false,
             shift: (pixels_from_centre(row), pixels_from_centre(column)),
             explained: explained_shifted,
             explained_unshifted: unshifted,
@@ -266,6 +276,29 @@ impl MeasurementStudy {
                 / (1.0 - explained_shifted).max(1e-3)
                 / self.frames as f64,
         })
+    }
+
+    /// The figures of a measurement without fine structure: masks that have one explain none of it.
+    fn flat(&self, mean: f64, negative_area: f64, masks_vary: bool) -> MeasurementFigures {
+        let explained = if masks_vary { 0.0 } else { 1.0 };
+        MeasurementFigures {
+            mean,
+            largest_mask: self.largest_mask,
+            negative_area,
+            brightness: vec![0.0; self.frames],
+            uncertainty: vec![0.0; self.frames],
+            offset: 0.0,
+            offset_uncertainty: 0.0,
+            shift: (0, 0),
+            explained,
+            explained_unshifted: explained,
+            shift_significance: 0.0,
+            mosaic: PhaseDifference::default(),
+            local_mosaic: PhaseDifference::default(),
+            drift: [Drift::default(); 2],
+            brightest: brightest(&self.strips, 0.0),
+            is_flat: true,
+        }
     }
 }
 
@@ -606,6 +639,10 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
     let wrong = copy_of_a_mask(figures).or_else(|| shifted_masks(figures));
     if let Some(finding) = wrong.or_else(|| foreign_masks(figures)) {
         findings.push(finding);
+        // Without a fit, all light counts as light of the scene.
+        if figures.is_flat && !has_mask_scale {
+            findings.extend(implausible_brightness(figures));
+        }
         return findings;
     }
     if let Some(amplitude) = mosaic_amplitude(figures) {
@@ -698,11 +735,15 @@ fn drifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
 /// Masks that explain next to nothing of the measurement.
 fn foreign_masks(figures: &MeasurementFigures) -> Option<Finding> {
     (figures.explained_unshifted < 0.02).then(|| {
-        let detail = format!(
-            "the masks explain only {:.1} % of the fine structure of the measurement: it was probably recorded with \
-             other masks",
-            figures.explained_unshifted * 100.0
-        );
+        let detail = if figures.is_flat {
+            "all pixels of the snapshot have nearly the same value, so no mask is visible in it".to_owned()
+        } else {
+            format!(
+                "the masks explain only {:.1} % of the fine structure of the measurement: it was probably recorded \
+                 with other masks",
+                figures.explained_unshifted * 100.0
+            )
+        };
         Finding::new(FindingCode::ForeignMasks, detail)
     })
 }
@@ -968,6 +1009,25 @@ mod tests {
         assert!(codes(&masks, &y).is_empty(), "{:?}", codes(&masks, &y));
         let lowered = codes(&masks, &(&y - 0.15 * y.mean().unwrap()));
         assert!(lowered.contains(&"negative"), "{lowered:?}");
+    }
+
+    #[test]
+    fn flat_measurements_show_no_mask_and_have_a_level() {
+        let (masks, open) = (fine_masks(8, 208), Array3::ones((8, 208, 208)));
+        let flat = |value: f32| Array2::from_elem((208, 208), value);
+        for (masks, value, expected) in [
+            (&masks, u64::MAX as f32, &["foreign_masks", "level"][..]),
+            (&masks, 0.1, &["foreign_masks", "level"]),
+            (&masks, 2.1, &["foreign_masks"]),
+            (&open, 2.1, &[]),
+            (&open, u64::MAX as f32, &["level"]),
+        ] {
+            assert_eq!(codes(masks, &flat(value)), expected, "{value}");
+        }
+        assert!(codes(&masks, &flat(-2.0)).contains(&"negative"));
+        let mut study = MeasurementStudy::new(8);
+        study.add(masks.view(), flat(0.0).view());
+        assert_eq!(study.finish(), None);
     }
 
     #[test]

@@ -104,7 +104,7 @@ fn check_count(opened: &Opened) -> Result<()> {
 /// `sink`. Pixels that are saturated, bad or not measured become NaN.
 ///
 /// Errors: [`IntakeError::Size`] for dark frames of another size; [`IntakeError::Format`] for unreadable files and
-/// measurements that are 0 everywhere, and for errors of `sink`. After an error the output of `sink` is invalid.
+/// measurements without light, and for errors of `sink`. After an error the output of `sink` is invalid.
 pub fn measurement(
     opened: Opened,
     exposure: &Exposure,
@@ -119,14 +119,14 @@ pub fn measurement(
     #[allow(clippy::cast_precision_loss)] // camera values are small
     let stated = exposure.saturation.map(|level| level as f32);
     let mut exposed = Exposed { reader, dark, stated, behind, defects: Vec::new(), bits };
-    let empty =
+    let dark =
         check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
     let judge = |bits: BitUsage| bits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
     // Saturation explains why no value is larger, so it comes first.
     let mut findings = defect_findings(&exposed.defects, info.height * info.width);
     findings.extend(exposed.bits.and_then(judge).map(Finding::from));
-    findings.extend(empty.into_iter().take(SNAPSHOTS).map(|snapshot| {
-        let finding = Finding::new(FindingCode::EmptySnapshot, "the snapshot is 0 everywhere");
+    findings.extend(dark.into_iter().take(SNAPSHOTS).map(|(snapshot, state)| {
+        let finding = Finding::new(FindingCode::EmptySnapshot, format!("the snapshot {state}"));
         Finding { snapshot: u32::try_from(snapshot).ok(), ..finding }
     }));
     Ok(Passed { findings })

@@ -80,6 +80,7 @@ pub fn judge(
         let number = u32::try_from(snapshot).ok();
         let mut judged = judge_measurement(&figures, dark_subtracted);
         if mosaic.is_none()
+            && !figures.is_flat
             && judged.iter().any(|finding| finding.code == FindingCode::ForeignMasks)
             && let Some(misplaced) = misplaced_masks((&masks, &snapshots), snapshot, &figures)?
         {

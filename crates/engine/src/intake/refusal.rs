@@ -85,7 +85,7 @@ impl TryFrom<FormatError> for Refusal {
             return Err(error);
         }
         let pointer = match &error {
-            FormatError::FullScale(_) => Some("/full_scale"),
+            FormatError::FullScale(_) | FormatError::Overflow { .. } => Some("/full_scale"),
             FormatError::AxesAmbiguous { .. } | FormatError::NoAxes(_) => Some("/axes"),
             FormatError::NoNames | FormatError::MissingArray { .. } => Some("/array"),
             FormatError::Part { field: "crop", .. } => Some("/crop"),

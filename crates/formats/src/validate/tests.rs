@@ -138,6 +138,15 @@ fn measurements_without_light_and_infinities_are_refused() {
     assert_names(&error.to_string(), &["snapshot 0 of 2", "zero everywhere"]);
     let kept = measurement(array![[[1.0]], [[0.0]], [[f32::NAN]]], 1.0).unwrap();
     assert!(kept[[1, 0, 0]] == 0.0 && kept[[2, 0, 0]].is_nan());
+    for (stack, full_scale, words) in [
+        (array![[[f32::NAN, f32::NAN]]], 1.0, &["snapshot 0 of 1", "no finite value"][..]),
+        (array![[[1e-30, f32::NAN]]], 1e30, &["full scale", "too large"]),
+        (array![[[0.5, 8.0]]], 1.2e-38, &["column 1", "8", "can't be represented", "full_scale"]),
+    ] {
+        let error = measurement(stack, full_scale).unwrap_err();
+        assert!(error.is_callers_fault());
+        assert_names(&error.to_string(), words);
+    }
     let error = measurement(array![[[1.0, f32::INFINITY]]], 1.0).unwrap_err();
     assert_names(&error.to_string(), &["measurement", "inf", "column 1"]);
 }
