@@ -234,3 +234,25 @@ pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use engine::job::CalibrationRequest;
+
+    use super::{Code, parse};
+
+    #[test]
+    fn arrays_of_a_wrong_length_are_invalid_fields() {
+        let masks = "0".repeat(64);
+        for frames in ["[0,1,2]", "[0]", "[]", "[0,1,[2]]", "[0,-1]", "7"] {
+            let body = format!(r#"{{"masks":"{masks}","frames":{frames}}}"#);
+            let error = parse::<CalibrationRequest>(body.as_bytes()).unwrap_err();
+            assert_eq!(error.code(), Code::InvalidRequest, "{frames}");
+            let problem = serde_json::to_value(error.problem()).unwrap();
+            let pointer = problem["pointer"].as_str().unwrap();
+            assert!(pointer.starts_with("/frames"), "{frames}: {pointer}");
+        }
+        let cut = parse::<CalibrationRequest>(br#"{"frames":[0,1"#).unwrap_err();
+        assert_eq!(cut.code(), Code::MalformedJson);
+    }
+}

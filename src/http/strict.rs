@@ -1,9 +1,11 @@
-//! A deserializer that accepts only objects for structs.
+//! A deserializer that accepts only objects for structs, and names arrays that are too long for a tuple.
 //!
-//! Derived implementations also accept an array with the fields in order, which the API description does not allow.
+//! Derived implementations also accept an array with the fields in order, which the API description does not allow. After
+//! the last item of a tuple the parser expects the end of the array, and takes more items for malformed JSON.
 
 use serde::de::{
-    DeserializeSeed, Deserializer, EnumAccess, Error, MapAccess, SeqAccess, VariantAccess, Visitor,
+    DeserializeSeed, Deserializer, EnumAccess, Error, IgnoredAny, MapAccess, SeqAccess,
+    VariantAccess, Visitor,
 };
 
 /// Wraps a deserializer, visitor or accessor, so that every struct inside it must be an object.
@@ -49,12 +51,27 @@ impl<'de, D: Deserializer<'de>> Deserializer<'de> for Strict<D> {
         deserialize_unit_struct(name: &'static str);
         deserialize_newtype_struct(name: &'static str);
         deserialize_seq();
-        deserialize_tuple(length: usize);
-        deserialize_tuple_struct(name: &'static str, length: usize);
         deserialize_map();
         deserialize_enum(name: &'static str, variants: &'static [&'static str]);
         deserialize_identifier();
         deserialize_ignored_any();
+    }
+
+    fn deserialize_tuple<V: Visitor<'de>>(
+        self,
+        length: usize,
+        visitor: V,
+    ) -> Result<V::Value, D::Error> {
+        self.0.deserialize_tuple(length, Tuple { length, visitor })
+    }
+
+    fn deserialize_tuple_struct<V: Visitor<'de>>(
+        self,
+        name: &'static str,
+        length: usize,
+        visitor: V,
+    ) -> Result<V::Value, D::Error> {
+        self.0.deserialize_tuple_struct(name, length, Tuple { length, visitor })
     }
 
     fn deserialize_struct<V: Visitor<'de>>(
@@ -201,7 +218,7 @@ impl<'de, A: VariantAccess<'de>> VariantAccess<'de> for Strict<A> {
         length: usize,
         visitor: V,
     ) -> Result<V::Value, A::Error> {
-        self.0.tuple_variant(length, Strict(visitor))
+        self.0.tuple_variant(length, Tuple { length, visitor })
     }
 
     fn struct_variant<V: Visitor<'de>>(
@@ -210,6 +227,33 @@ impl<'de, A: VariantAccess<'de>> VariantAccess<'de> for Strict<A> {
         visitor: V,
     ) -> Result<V::Value, A::Error> {
         self.0.newtype_variant_seed(Object(visitor))
+    }
+}
+
+/// Reads an array of a fixed length.
+struct Tuple<V> {
+    length: usize,
+    visitor: V,
+}
+
+impl<'de, V: Visitor<'de>> Visitor<'de> for Tuple<V> {
+    type Value = V::Value;
+
+    fn expecting(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.visitor.expecting(formatter)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<V::Value, A::Error> {
+        let value = self.visitor.visit_seq(Strict(&mut items))?;
+        let mut length = self.length;
+        while items.next_element::<IgnoredAny>()?.is_some() {
+            length += 1;
+        }
+        if length == self.length {
+            return Ok(value);
+        }
+        let detail = format_args!("the array has {length} items; {} are expected", self.length);
+        Err(A::Error::custom(detail))
     }
 }
 
@@ -272,6 +316,8 @@ mod tests {
             ("/choice/Struct", json!([{"one": 3}])),
             ("/choice/Struct/inner", json!([3])),
             ("/choice", json!({"New": [3]})),
+            ("/pair", json!([1, 2, 3])),
+            ("/pair", json!([1])),
             ("", json!([null, [], [1, 2], "Unit"])),
         ] {
             let mut bad = good.clone();

@@ -164,6 +164,8 @@ async fn bad_fields_are_rejected_with_their_pointer() {
         ("camera_fps", json!(0)),
         ("camera_fps", json!(1e300)),
         ("exposure_s", json!(-0.1)),
+        ("saturation", json!(0)),
+        ("dark", json!(vec![&nowhere; 2049])),
         ("calibration", json!("019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d")),
         ("calibration", json!("mine")),
         ("data", json!(nowhere)),

@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{InvalidField, Sha256};
 
-/// Largest number of uploads for one capture.
-const MAX_REPEATS: usize = 4096;
+/// Largest number of uploads for one capture. Their hashes fit into a JSON body of 256 KiB, also with indentation.
+pub(super) const MAX_REPEATS: usize = 2048;
 /// Largest number of masks of a calibration. Published systems have up to 50.
 pub const MAX_MASKS: usize = 64;
 

@@ -1,7 +1,10 @@
 //! Requests to create a calibration, measurement or model from uploads.
 
+use std::ops::RangeInclusive;
+
 use serde::{Deserialize, Serialize};
 
+use super::captures::MAX_REPEATS;
 use super::reading::keeps_mosaic;
 use super::{CalibrationId, Captures, InvalidField, Label, Mosaic, Sequence, Sha256};
 use formats::{Axes, Crop, FullScale, Packing};
@@ -9,6 +12,12 @@ use formats::{Axes, Crop, FullScale, Packing};
 /// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
 const CHECK_S: f64 = 20e-9;
 const SHORTEST_CHECK_S: f64 = 0.05;
+/// Plausible frame rates of cameras, in snapshots per second.
+const FRAME_RATES: RangeInclusive<f64> = 1e-6..=1e9;
+/// Plausible exposures of a snapshot, in seconds.
+const EXPOSURES_S: RangeInclusive<f64> = 1e-9..=1e6;
+/// An exposure may exceed the time between two snapshots by this share, because cameras display rounded numbers.
+const EXPOSURE_TOLERANCE: f64 = 1e-3;
 /// CPU-seconds of loading a small network and running it once.
 const MODEL_S: f64 = 1.0;
 
@@ -71,7 +80,7 @@ pub struct MeasurementRequest {
     pub packing: Option<Packing>,
     /// Captures with the LCoS all black, at the measurement's exposure. The average of the captures is subtracted.
     #[serde(default)]
-    #[schemars(length(max = 4096))]
+    #[schemars(length(max = 2048))]
     pub dark: Vec<Sha256>,
     /// Smallest stored number of a saturated pixel.
     #[schemars(range(min = 1))]
@@ -82,10 +91,10 @@ pub struct MeasurementRequest {
     #[schemars(range(min = 1.2e-38, max = 3.4e38))]
     pub full_scale: Option<f32>,
     /// Snapshots per second.
-    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1e9))]
+    #[schemars(range(min = 1e-6, max = 1e9))]
     pub camera_fps: Option<f64>,
-    /// Exposure of one snapshot in seconds.
-    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1e5))]
+    /// Exposure of one snapshot in seconds, at most 1 / `camera_fps`.
+    #[schemars(range(min = 1e-9, max = 1e6))]
     pub exposure_s: Option<f64>,
     /// States whether the snapshots follow one another; without it, the times decide.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -178,7 +187,7 @@ impl Submission {
                 check_full_scale(request.full_scale)
             }
             Self::Measurement(request) => {
-                request.check_times()?;
+                request.check_numbers()?;
                 check_full_scale(request.full_scale)
             }
             Self::Model(_) => Ok(()),
@@ -245,22 +254,87 @@ impl MeasurementRequest {
         }
     }
 
-    /// Refuses times that are out of range: they become the times of frames.
-    fn check_times(&self) -> Result<(), Vec<InvalidField>> {
-        let checks = [
-            ("/camera_fps", self.camera_fps, 1e9, "snapshots in a second"),
-            ("/exposure_s", self.exposure_s, 1e5, "seconds"),
+    /// Refuses numbers that are out of range, and exposures that overlap: they become the times of frames.
+    fn check_numbers(&self) -> Result<(), Vec<InvalidField>> {
+        let times = [
+            ("/camera_fps", self.camera_fps, FRAME_RATES, "snapshots in a second"),
+            ("/exposure_s", self.exposure_s, EXPOSURES_S, "seconds"),
         ];
         let mut errors = Vec::new();
-        for (pointer, value, most, unit) in checks {
+        for (pointer, value, range, unit) in times {
             if let Some(value) = value
-                && !(value > 0.0 && value <= most)
+                && !range.contains(&value)
             {
-                let detail =
-                    format!("{value} {unit} can't be; it must be above 0 and at most {most}");
+                let (least, most) = range.into_inner();
+                let detail = format!("{value:?} {unit} are outside {least:e} to {most:e}");
                 errors.push(InvalidField::new(pointer, detail));
             }
         }
+        if let (true, Some(fps), Some(exposure)) =
+            (errors.is_empty(), self.camera_fps, self.exposure_s)
+            && exposure * fps > 1.0 + EXPOSURE_TOLERANCE
+        {
+            let detail = format!(
+                "an exposure of {exposure} s is longer than the {:.6} s between two snapshots at a camera_fps of {fps}: \
+                 correct one of them",
+                1.0 / fps
+            );
+            errors.push(InvalidField::new("/exposure_s", detail));
+        }
+        if self.saturation == Some(0) {
+            let detail = "the smallest number of a saturated pixel is at least 1; leave saturation out for the default";
+            errors.push(InvalidField::new("/saturation", detail));
+        }
+        if self.dark.len() > MAX_REPEATS {
+            let detail = format!(
+                "{} dark frames; at most {MAX_REPEATS} files are averaged",
+                self.dark.len()
+            );
+            errors.push(InvalidField::new("/dark", detail));
+        }
         if errors.is_empty() { Ok(()) } else { Err(errors) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{CalibrationId, MAX_REPEATS, MeasurementRequest, Sha256};
+
+    #[test]
+    fn numbers_that_no_camera_has_are_refused() {
+        let request = MeasurementRequest::new(None, CalibrationId::new(), Sha256::of(b"data"));
+        let refused = |fps: Option<f64>, exposure: Option<f64>| {
+            let timed =
+                MeasurementRequest { camera_fps: fps, exposure_s: exposure, ..request.clone() };
+            let errors = timed.check_numbers().err().unwrap_or_default();
+            errors.into_iter().map(|error| error.pointer).collect::<Vec<_>>()
+        };
+        for (fps, exposure, pointers) in [
+            (Some(50.0), Some(0.02), &[][..]),
+            // Rounded in a camera's menu.
+            (Some(30.0), Some(0.033_34), &[]),
+            (Some(1e-6), Some(1e6), &[]),
+            (Some(1e9), Some(1e-9), &[]),
+            (Some(1000.0), Some(1.0), &["/exposure_s"]),
+            (Some(50.0), Some(0.021), &["/exposure_s"]),
+            (Some(5e-324), Some(1e5), &["/camera_fps"]),
+            (Some(f64::NAN), Some(1e-300), &["/camera_fps", "/exposure_s"]),
+            (Some(1.1e9), None, &["/camera_fps"]),
+            (None, Some(1.1e6), &["/exposure_s"]),
+        ] {
+            assert_eq!(refused(fps, exposure), pointers, "{fps:?} {exposure:?}");
+        }
+        for (wrong, pointer) in [
+            (MeasurementRequest { saturation: Some(0), ..request.clone() }, "/saturation"),
+            (
+                MeasurementRequest { dark: vec![request.data; MAX_REPEATS + 1], ..request.clone() },
+                "/dark",
+            ),
+        ] {
+            assert_eq!(wrong.check_numbers().unwrap_err()[0].pointer, pointer);
+        }
+        let most = MeasurementRequest { dark: vec![request.data; MAX_REPEATS], ..request };
+        most.check_numbers().unwrap();
+        assert!(serde_json::to_string_pretty(&most).unwrap().len() < 256 * 1024);
     }
 }

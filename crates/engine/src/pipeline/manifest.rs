@@ -256,7 +256,10 @@ impl CameraRecord {
         snapshot: usize,
         frames: usize,
     ) -> Option<Self> {
-        let exposure = exposure_s.or_else(|| fps.map(|fps| 1.0 / fps))?;
+        let period = fps.map(|fps| 1.0 / fps);
+        // A rounded exposure may exceed the period, and the times must not run backwards.
+        let exposure = exposure_s.map(|exposure| exposure.min(period.unwrap_or(f64::INFINITY)));
+        let exposure = exposure.or(period)?;
         let start = match (fps, snapshot) {
             (Some(fps), _) => Some(snapshot as f64 / fps),
             (None, 0) => Some(0.0),
