@@ -268,7 +268,7 @@ async fn reserve(app: &TestApp) -> PathBuf {
 }
 
 #[tokio::test]
-async fn a_disk_that_fills_takes_deletions_and_leaves_no_half_line_in_the_audit_log() {
+async fn a_full_disk_permits_deletions_and_cuts_no_audit_line() {
     let Some(disk) = SmallDisk::mount("size=160m") else {
         return crate::app::skip("a file system can't be mounted: run the test as root");
     };

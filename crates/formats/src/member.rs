@@ -71,7 +71,7 @@ pub(super) fn distinct(members: Vec<Member>, format: Format) -> Result<Vec<Membe
         None => Ok(members),
         Some(member) => {
             let name = quoted(&member.name);
-            let problem = format!("two members have the name {name}: make the archive anew");
+            let problem = format!("two members have the name {name}: rename one of them");
             Err(FormatError::malformed(format, problem))
         }
     }

@@ -179,7 +179,7 @@ pub fn check_snapshots(
     let (mut snapshots, mut dark) = (0, Vec::new());
     while let Some(mut snapshot) = reader.next_frame()? {
         check_size(&info, snapshots, &snapshot)?;
-        // What the snapshot is as long as no pixel has light.
+        // The state that is reported if no pixel has light.
         let (mut has_light, mut state) = (false, Lightless::NotMeasured);
         for ((row, column), value) in snapshot.indexed_iter_mut() {
             let scaled = *value / scale;

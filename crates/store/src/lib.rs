@@ -140,7 +140,7 @@ impl Store {
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
             .connect_with(options.clone());
         let writer = writer.await?;
-        // A connection that is made later must not make the database anew where its file is missing.
+        // A connection that is made later must not create a database where the file is missing.
         let options = options.create_if_missing(false);
         writer.set_connect_options(options.clone());
         schema.apply(&writer).await.map_err(|error| match copy {
