@@ -263,7 +263,7 @@ CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
 
 CREATE TABLE notifications (
-    -- What remains to be sent to the webhooks of jobs that have ended.
+    -- Unsent notifications of jobs that have ended.
     id       INTEGER PRIMARY KEY AUTOINCREMENT,
     job      TEXT NOT NULL UNIQUE REFERENCES jobs (id) ON DELETE CASCADE,
     attempts INTEGER NOT NULL DEFAULT 0,

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use engine::job::{Timestamp, Webhook};
 use store::{Job, Notification, Store, StoreError};
 
-/// Time between two looks at what is to be sent.
+/// Time between two searches for unsent notifications.
 const TICK: Duration = Duration::from_secs(1);
 /// Time that a receiver has to answer.
 const TIMEOUT: Duration = Duration::from_secs(10);
@@ -137,7 +137,7 @@ async fn post(
     }
 }
 
-/// What a receiver gets.
+/// The body of a notification.
 fn message(job: &Job) -> Value {
     json!({
         "type": "job.ended",
