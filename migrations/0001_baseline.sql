@@ -262,6 +262,23 @@ CREATE INDEX jobs_calibration ON jobs (calibration);
 CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
 
+CREATE TABLE notifications (
+    -- Unsent notifications of jobs that have ended.
+    id       INTEGER PRIMARY KEY AUTOINCREMENT,
+    job      TEXT NOT NULL UNIQUE REFERENCES jobs (id) ON DELETE CASCADE,
+    attempts INTEGER NOT NULL DEFAULT 0,
+    next_at  INTEGER, -- time of the next attempt; NULL if it was given up
+    error    TEXT -- why the last attempt failed
+) STRICT;
+
+CREATE INDEX notifications_due ON notifications (next_at) WHERE next_at IS NOT NULL;
+
+CREATE TABLE webhook_secrets (
+    -- Keys that sign the notifications of each lab. Receivers have a copy.
+    lab    TEXT PRIMARY KEY,
+    secret BLOB NOT NULL CHECK (length(secret) = 32)
+) STRICT, WITHOUT ROWID;
+
 CREATE TABLE removals (
     -- Files whose rows are deleted, until the files are removed. A start after a kill continues with them.
     kind       TEXT NOT NULL CHECK (kind IN ('blob', 'results')),
@@ -670,6 +687,13 @@ CREATE TRIGGER changes_of_request_tasks_change AFTER UPDATE OF state, fraction O
     WHEN NEW.thing IS NOT NULL AND (OLD.state <> NEW.state OR OLD.fraction <> NEW.fraction)
 BEGIN
     INSERT INTO changes (what, lab, id) SELECT what, lab, id FROM requests WHERE id = NEW.thing;
+END;
+
+CREATE TRIGGER notifications_add AFTER UPDATE OF state ON jobs
+    WHEN NEW.state IN ('succeeded', 'failed', 'cancelled') AND OLD.state <> NEW.state
+         AND json_extract(NEW.spec, '$.webhook') IS NOT NULL
+BEGIN
+    INSERT OR REPLACE INTO notifications (job, next_at) VALUES (NEW.id, 0);
 END;
 
 CREATE TRIGGER upload_keys_end AFTER DELETE ON partials

@@ -60,6 +60,16 @@ pub struct ServeArguments {
     #[arg(long, env = "SCI_RECON_TRUSTED_PROXIES", value_name = "NETWORK", value_delimiter = ',', value_parser = network)]
     pub trusted_proxies: Vec<IpNet>,
 
+    /// Hosts that may be notified when jobs end, separated by commas, with the port unless it is the default one of http or
+    /// https. Jobs with a webhook on another host are refused [default: none].
+    #[arg(
+        long = "webhook-host",
+        env = "SCI_RECON_WEBHOOK_HOSTS",
+        value_name = "HOST",
+        value_delimiter = ','
+    )]
+    pub webhook_hosts: Vec<String>,
+
     /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
     /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
     /// one per core].

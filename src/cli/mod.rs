@@ -9,6 +9,7 @@ mod client;
 mod command_line;
 mod confine;
 mod error;
+mod exec;
 #[cfg(feature = "nats")]
 mod guard;
 mod logging;

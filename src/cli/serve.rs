@@ -119,6 +119,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let maintenance =
         maintain(store.clone(), move || folded.upkeep(), settings.clone(), audit.clone());
     tokio::spawn(closing.clone().run_until_cancelled_owned(maintenance));
+    let webhooks = crate::webhooks::send(store.clone(), settings.webhook_hosts.clone());
+    tokio::spawn(closing.clone().run_until_cancelled_owned(webhooks));
     if settings.scrub_bytes > 0 {
         let (store, rate) = (store.clone(), settings.scrub_bytes);
         let scrub = async move { store.scrub(rate).await };

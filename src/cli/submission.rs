@@ -110,6 +110,9 @@ pub(super) struct SubmissionArguments {
     /// Label of the job [default: none; of watch-folder: the name of the file].
     #[arg(long, value_name = "TEXT", help_heading = JOB)]
     label: Option<String>,
+    /// Address that is notified when the job ends; the administrator allows its host [default: none].
+    #[arg(long, value_name = "URL", help_heading = JOB)]
+    webhook: Option<String>,
 }
 
 const CALIBRATION: &str = "Calibration";
@@ -207,6 +210,7 @@ impl SubmissionArguments {
         add(&mut body, "tile", json!(tile));
         add(&mut body, "priority", json!(self.priority));
         add(&mut body, "label", json!(self.label));
+        add(&mut body, "webhook", json!(self.webhook));
         body
     }
 
@@ -315,6 +319,7 @@ mod tests {
             ("overlap", "16"),
             ("priority", "-3"),
             ("label", "milk"),
+            ("webhook", "https://lab.example/hook"),
         ];
         let mut known: BTreeSet<&str> = values.iter().map(|(name, _)| *name).collect();
         // It replaces the options of masks.

@@ -19,7 +19,7 @@ use super::problems;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Finding, FindingCode, InvalidField, JobId, JobRequest,
     JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule,
-    Sequence, SnapshotRange, TileSpec, Timestamp, priority_error,
+    Sequence, SnapshotRange, TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
@@ -61,7 +61,54 @@ pub(super) struct JobBody {
     /// Predicted quality of the frames, mean over the snapshots. Null until the job has succeeded, and where no prediction
     /// is possible: colour sensors, models of users, and schedules without a quality model.
     assessment: Option<Assessment>,
+    /// The address that is notified when the job ends.
+    webhook: Option<WebhookBody>,
     progress: JobProgress,
+}
+
+/// The notification of a job.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "JobWebhook")]
+struct WebhookBody {
+    url: Webhook,
+    state: WebhookState,
+    /// Failed attempts since the job ended.
+    attempts: u32,
+    /// Time of the next attempt.
+    next_at: Option<Timestamp>,
+    /// Why the last attempt failed.
+    error: Option<String>,
+}
+
+/// State of a notification.
+#[derive(Debug, Clone, Copy, Serialize, schemars::JsonSchema)]
+#[serde(rename_all = "snake_case")]
+enum WebhookState {
+    /// The job has not ended.
+    Pending,
+    /// It is being sent, or sent again after a pause.
+    Sending,
+    /// The receiver has confirmed it.
+    Delivered,
+    /// It was given up.
+    Failed,
+}
+
+impl WebhookBody {
+    async fn new(app: &App, job: &Job) -> Result<Option<Self>> {
+        let Some(url) = job.spec.webhook.clone() else { return Ok(None) };
+        let delivery = app.store.delivery(job).await?;
+        let state = match &delivery {
+            _ if !job.state.is_final() => WebhookState::Pending,
+            None => WebhookState::Delivered,
+            Some(delivery) if delivery.next_at.is_some() => WebhookState::Sending,
+            Some(_) => WebhookState::Failed,
+        };
+        let attempts = delivery.as_ref().map_or(0, |delivery| delivery.attempts);
+        let (next_at, error) =
+            delivery.map_or((None, None), |delivery| (delivery.next_at, delivery.error));
+        Ok(Some(Self { url, state, attempts, next_at, error }))
+    }
 }
 
 /// The failure of a job. Codes are `task_failed`, `out_of_memory`, `worker_crashed` and `worker_lost`.
@@ -112,6 +159,7 @@ impl JobBody {
             }
             _ => None,
         };
+        let webhook = WebhookBody::new(app, &job).await?;
         let spec = job.spec;
         Ok(Self {
             id: job.id,
@@ -136,6 +184,7 @@ impl JobBody {
             started_at: job.started_at,
             finished_at: job.finished_at,
             assessment: job.assessment,
+            webhook,
             progress,
         })
     }
@@ -295,6 +344,7 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     spec.warnings.extend(warnings_of(measurement.warnings, spec.snapshots));
     check_memory(app, &spec)?;
     check_networks(app, &spec)?;
+    check_webhook(app, &spec)?;
     Ok(spec)
 }
 
@@ -315,6 +365,20 @@ fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding>
     let concerns =
         |warning: &Finding| warning.snapshot.is_none_or(|snapshot| snapshots.contains(snapshot));
     warnings.into_iter().filter(concerns).collect()
+}
+
+/// Rejects a webhook on a host that the administrator has not allowed.
+fn check_webhook(app: &App, spec: &JobSpec) -> Result<()> {
+    let Some(webhook) = &spec.webhook else { return Ok(()) };
+    if webhook.is_allowed(&app.settings.webhook_hosts) {
+        return Ok(());
+    }
+    let place = webhook.place();
+    let detail = format!(
+        "webhooks may not notify the host {place}: ask the administrator to start the service with \
+         --webhook-host {place}"
+    );
+    Err(ApiError::fields(Code::InvalidRequest, vec![InvalidField::new("/webhook", detail)]))
 }
 
 /// Rejects a job that needs more memory than a worker has.

@@ -84,6 +84,7 @@ pub(super) async fn create(
         tile: None,
         priority: 0,
         label: request.label,
+        webhook: None,
     };
     let key = hashed_key(key, &job)?;
     let (status, job) = jobs::make(&app, &access, job, key).await?;

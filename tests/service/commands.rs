@@ -300,12 +300,19 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     std::fs::create_dir(lab.path("bench")).unwrap();
     lab.write("bench/oops.npy", &SCENE.masks());
     let watch = ["watch-folder", "bench", "--once", "--settle-seconds", "0.1"];
-    let watched = lab.run(&[&watch[..], &masks, &["--file", "manifest.json"]].concat()).await;
+    let exec = "echo \"$JOB_STATE $JOB_FILE $JOB_RESULTS\" >> ended";
+    let options = ["--file", "manifest.json", "--exec", exec];
+    let watched = lab.run(&[&watch[..], &masks, &options].concat()).await;
     let text = String::from_utf8(watched.stdout).unwrap();
     assert_eq!(watched.status.code(), Some(3), "{text}");
     assert!(
         text.contains("    error ") && text.contains("oops.npy is in oops.npy.result"),
         "{text}"
+    );
+    let ended = std::fs::read_to_string(lab.path("ended")).unwrap();
+    assert!(
+        ended.starts_with("succeeded /") && ended.ends_with("bench/oops.npy.result\n"),
+        "{ended}"
     );
     let report = std::fs::read_to_string(lab.path("bench/oops.npy.result/REPORT.txt")).unwrap();
     assert!(report.starts_with("oops.npy: bad") && report.contains("\nerror "), "{report}");

@@ -49,6 +49,7 @@ mod storm;
 mod upgrade;
 mod uploads;
 mod watching;
+mod webhooks;
 mod white_level;
 mod work;
 mod wrong_inputs;

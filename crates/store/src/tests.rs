@@ -180,6 +180,7 @@ impl Lab {
             tile: Some(TileSpec { size: 64, overlap: 8 }),
             priority,
             label: None,
+            webhook: None,
         };
         let sequence = measurement.sequence;
         let spec = job.resolve(measurement.calibration, shape, sequence, None).unwrap();

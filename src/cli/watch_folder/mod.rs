@@ -24,6 +24,7 @@ use uuid::Uuid;
 use super::CliError;
 use super::client::{Client, ClientError, Job, ServiceArguments, Wanted, rename_new};
 use super::error::Result;
+use super::exec::ExecArguments;
 use super::output::print_line;
 use super::submission::{Recipe, SubmissionArguments};
 use super::verdict;
@@ -58,6 +59,8 @@ pub struct Arguments {
     #[arg(long = "file", value_name = "NAME", value_delimiter = ',', value_enum,
           default_values = ["frames.npy", "stack.tif", "manifest.json"])]
     files: Vec<Wanted>,
+    #[command(flatten)]
+    exec: ExecArguments,
     /// End when all files are done.
     #[arg(long)]
     once: bool,
@@ -243,6 +246,7 @@ impl Watch<'_> {
     async fn fetch(&mut self, entry: &Entry, job: &str) -> Result<Option<Stage>, ClientError> {
         let job = self.client.job(job, 0).await?;
         if let Some(reason) = job.failure() {
+            self.exec(entry, &job, &failure_file(&entry.results)).await;
             let findings = verdict::lines(&job.findings());
             let reason = [vec![reason], findings].concat().join("\n");
             return Ok(Some(Stage::Failed { reason }));
@@ -253,6 +257,7 @@ impl Watch<'_> {
         let folder = self.folder.join(result_folder(&entry.results));
         self.client.fetch(&job, &self.arguments.files, &folder).await?;
         self.write_report(entry, &job, &folder)?;
+        self.exec(entry, &job, &result_folder(&entry.results)).await;
         Ok(Some(Stage::Done { job: job.id }))
     }
 
@@ -306,6 +311,14 @@ impl Watch<'_> {
             print_line(format!("{} {step}", entry.shot.name))?;
         }
         self.ledger.record(entry)
+    }
+
+    /// Runs the command of the user before the ledger names the end of the job, so that a kill can't leave it out.
+    async fn exec(&self, entry: &Entry, job: &Job, results: &str) {
+        let (file, results) = (self.folder.join(&entry.shot.name), self.folder.join(results));
+        if let Err(error) = self.arguments.exec.run(job, Some((&file, &results))).await {
+            eprintln!("sci-recon: {error}");
+        }
     }
 
     /// Prints why the service is unavailable, and waits.

@@ -19,7 +19,7 @@ use super::composed::{Composed, Content, Part, Section, Source};
 use super::format::Format;
 use engine::job::JobId;
 use engine::pipeline::manifest::CameraRecord;
-use formats::{Channels, bigtiff, npy};
+use formats::{Channels, clip_tiff, npy};
 use store::Job;
 
 const ARRAY: &str = "frames.npy";
@@ -58,11 +58,11 @@ impl FromRequestParts<App> for Clip {
     }
 }
 
-/// `tiff`: a BigTIFF with OME-XML and an ImageJ description.
+/// `tiff`: an OME-TIFF; a BigTIFF if it is larger than 4 GiB.
 pub(super) async fn tiff(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let times = clip.times().await?;
     let name = clip.snapshot.map_or(String::new(), |snapshot| format!(" snapshot {snapshot}"));
-    let head = bigtiff::head(&bigtiff::Clip {
+    let head = clip_tiff::head(&clip_tiff::Clip {
         name: &format!("{}{name}", clip.job.id),
         shape: clip.shape(),
         channels: clip.channels(),

@@ -104,6 +104,7 @@ class Client:
         model: str | None = None,
         priority: int = 0,
         label: str | None = None,
+        webhook: str | None = None,
         key: str | None = None,
         folder: str | os.PathLike[str] | None = None,
     ) -> Result:
@@ -156,6 +157,7 @@ class Client:
             model=model,
             priority=priority,
             label=label,
+            webhook=webhook,
             key=key,
         ).wait()
         for finding in job.findings:
@@ -281,12 +283,13 @@ class Client:
         model: str | None = None,
         priority: int = 0,
         label: str | None = None,
+        webhook: str | None = None,
         key: str | None = None,
     ) -> Job:
         """Submits a job without waiting for it.
 
         `snapshots` is "all", an index from 0, or (first, last), both included. A repeated request with the same `key`
-        returns the job of the first one.
+        returns the job of the first one. The service notifies `webhook`, an address, when the job ends.
         """
         return Job(
             self,
@@ -302,6 +305,7 @@ class Client:
                 model=model,
                 priority=priority,
                 label=label,
+                webhook=webhook,
             ),
         )
 

@@ -123,6 +123,7 @@ mod tests {
             tile: TileSpec { size: side, overlap: 0 },
             priority: 0,
             label: None,
+            webhook: None,
             warnings: Vec::new(),
         }
     }

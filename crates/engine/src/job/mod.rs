@@ -16,6 +16,7 @@ mod state;
 mod submission;
 mod task;
 mod text;
+mod webhook;
 
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
@@ -45,3 +46,4 @@ pub use task::{
     TaskState, movie_step,
 };
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};
+pub use webhook::Webhook;

@@ -11,6 +11,7 @@ use super::model::{JobModel, ModelChoice};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
+use super::webhook::Webhook;
 use reconstruction::ReconError;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::SequencePlan;
@@ -127,6 +128,9 @@ pub struct JobRequest {
     /// A name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub label: Option<Label>,
+    /// The address to notify when the job ends; by default none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub webhook: Option<Webhook>,
 }
 
 /// A job after all checks, with all defaults filled in. It is stored and recorded in this form.
@@ -148,6 +152,7 @@ pub struct JobSpec {
     pub tile: TileSpec,
     pub priority: i32,
     pub label: Option<Label>,
+    pub webhook: Option<Webhook>,
     pub warnings: Vec<Finding>,
 }
 
@@ -209,7 +214,7 @@ impl JobRequest {
             return Err(errors);
         }
         let (measurement, algorithm) = (self.measurement, self.algorithm);
-        let (priority, label) = (self.priority, self.label);
+        let (priority, label, webhook) = (self.priority, self.label, self.webhook);
         let spec = JobSpec {
             calibration,
             measurement,
@@ -223,6 +228,7 @@ impl JobRequest {
             tile,
             priority,
             label,
+            webhook,
             warnings: Vec::new(),
         };
         match excess_tasks(&spec) {

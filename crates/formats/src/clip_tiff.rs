@@ -1,8 +1,8 @@
-//! Writes the head of a BigTIFF, which is followed by raw frames: little-endian float32, one strip each.
+//! Writes the head of a TIFF of a clip, which is followed by raw frames: little-endian float32, one strip each.
 //!
-//! All directories precede the pixels, so a file can be streamed as this head and raw frames. The first page has two
-//! descriptions: OME-XML, and ImageJ's lines for programs that do not read OME-XML. The `tiff` crate writes only one
-//! description per page, and directories after the pixels.
+//! All directories precede the pixels, so a file can be streamed as this head and raw frames; the `tiff` crate writes
+//! directories after the pixels. Files below 4 GiB are classic TIFF, which more programs read than BigTIFF. The first page
+//! is described in OME-XML.
 
 use std::fmt::Write;
 
@@ -23,90 +23,122 @@ pub struct Clip<'a> {
     pub times_s: Option<&'a [f64]>,
 }
 
-/// Byte order, version, size of offsets, and offset of the first directory.
-const HEADER: [u8; 16] = *b"II\x2b\0\x08\0\0\0\x10\0\0\0\0\0\0\0";
 const ASCII: u16 = 2;
 const SHORT: u16 = 3;
 const LONG: u16 = 4;
 const LONG8: u16 = 16;
-/// Length of an entry of a directory, in bytes.
-const ENTRY: usize = 20;
-/// Number of entries of a page without descriptions.
+/// Number of entries of a page without a description.
 const ENTRIES: usize = 10;
 const DESCRIPTION: u16 = 270;
 /// Alignment of the first frame, in bytes.
 const ALIGNMENT: usize = 64;
 
+/// A kind of TIFF.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Classic,
+    Big,
+}
+
+impl Kind {
+    /// Byte order, version, and offset of the first directory.
+    fn header(self) -> &'static [u8] {
+        match self {
+            Self::Classic => b"II\x2a\0\x08\0\0\0",
+            Self::Big => b"II\x2b\0\x08\0\0\0\x10\0\0\0\0\0\0\0",
+        }
+    }
+
+    /// Length of an offset, and of the count and value of an entry, in bytes.
+    fn offset(self) -> usize {
+        if self == Self::Classic { 4 } else { 8 }
+    }
+
+    /// Length of the number of entries of a directory, in bytes.
+    fn count(self) -> usize {
+        if self == Self::Classic { 2 } else { 8 }
+    }
+
+    /// Length of a directory, in bytes.
+    fn directory(self, entries: usize) -> usize {
+        self.count() + entries * (4 + 2 * self.offset()) + self.offset()
+    }
+
+    /// The type of offsets and lengths of frames.
+    fn long(self) -> u16 {
+        if self == Self::Classic { LONG } else { LONG8 }
+    }
+}
+
 /// Returns the bytes before the first frame.
 pub fn head(clip: &Clip<'_>) -> Vec<u8> {
     let (frames, height, width) = clip.shape;
+    let frame_bytes = height * width * clip.channels.count() * size_of::<f32>();
+    let classic = head_of(Kind::Classic, clip, frame_bytes);
+    if u32::try_from(classic.len() + frames * frame_bytes).is_ok() {
+        return classic;
+    }
+    head_of(Kind::Big, clip, frame_bytes)
+}
+
+#[allow(clippy::cast_possible_truncation)] // The caller takes the kind whose offsets hold the file.
+fn head_of(kind: Kind, clip: &Clip<'_>, frame_bytes: usize) -> Vec<u8> {
+    let (frames, height, width) = clip.shape;
     let channels = clip.channels.count();
-    let mut texts = vec![ome(clip)];
-    // ImageJ does not support floating-point colours.
-    texts.extend((clip.channels == Channels::Grey).then(|| imagej(clip)));
-    let texts: Vec<_> = texts.iter().map(|text| [text.as_bytes(), b"\0"].concat()).collect();
-    let directory = |entries: usize| 8 + entries * ENTRY + 8;
-    let first_directory = directory(ENTRIES + texts.len());
-    let texts_start =
-        HEADER.len() + first_directory + frames.saturating_sub(1) * directory(ENTRIES);
-    let length =
-        (texts_start + texts.iter().map(Vec::len).sum::<usize>()).next_multiple_of(ALIGNMENT);
-    let frame_bytes = height * width * channels * size_of::<f32>();
-    // Repeats a 16-bit number for each channel.
-    let for_each_channel =
-        |number: usize| (0..channels).map(|channel| number << (16 * channel)).sum();
-    let mut head = HEADER.to_vec();
+    let text = [ome(clip).as_bytes(), b"\0"].concat();
+    // Numbers for each channel do not fit into an entry of a classic TIFF.
+    let first_directory = kind.header().len();
+    let other_directories = first_directory + kind.directory(ENTRIES + 1);
+    let sample_sizes = other_directories + frames.saturating_sub(1) * kind.directory(ENTRIES);
+    let sample_formats = sample_sizes + channels * size_of::<u16>();
+    let text_start = sample_formats + channels * size_of::<u16>();
+    let length = (text_start + text.len()).next_multiple_of(ALIGNMENT);
+    let for_each_channel = |number: u16, place: usize| match channels {
+        1 => usize::from(number),
+        _ if kind == Kind::Classic => place,
+        _ => (0..channels).map(|channel| usize::from(number) << (16 * channel)).sum(),
+    };
+    let put = |head: &mut Vec<u8>, number: usize, bytes: usize| {
+        head.extend(&(number as u64).to_le_bytes()[..bytes]);
+    };
+    let mut head = kind.header().to_vec();
     head.reserve_exact(length - head.len());
     for frame in 0..frames {
         let mut entries: Vec<(u16, u16, usize, usize)> = vec![
             (256, LONG, 1, width),
             (257, LONG, 1, height),
             // 32 bits per sample, not compressed.
-            (258, SHORT, channels, for_each_channel(32)),
+            (258, SHORT, channels, for_each_channel(32, sample_sizes)),
             (259, SHORT, 1, 1),
             // BlackIsZero, or RGB.
             (262, SHORT, 1, if channels == 1 { 1 } else { 2 }),
-            (273, LONG8, 1, length + frame * frame_bytes),
+            (273, kind.long(), 1, length + frame * frame_bytes),
             (277, SHORT, 1, channels),
             (278, LONG, 1, height),
-            (279, LONG8, 1, frame_bytes),
+            (279, kind.long(), 1, frame_bytes),
             // Floating point.
-            (339, SHORT, channels, for_each_channel(3)),
+            (339, SHORT, channels, for_each_channel(3, sample_formats)),
         ];
         if frame == 0 {
-            let mut offset = texts_start;
-            for (index, text) in texts.iter().enumerate() {
-                entries.insert(5 + index, (DESCRIPTION, ASCII, text.len(), offset));
-                offset += text.len();
-            }
+            entries.insert(5, (DESCRIPTION, ASCII, text.len(), text_start));
         }
-        head.extend((entries.len() as u64).to_le_bytes());
-        for (tag, kind, count, value) in &entries {
+        put(&mut head, entries.len(), kind.count());
+        for (tag, field, count, value) in &entries {
             head.extend(tag.to_le_bytes());
-            head.extend(kind.to_le_bytes());
-            head.extend((*count as u64).to_le_bytes());
+            head.extend(field.to_le_bytes());
+            put(&mut head, *count, kind.offset());
             // Shorter types use the first bytes of the field.
-            head.extend((*value as u64).to_le_bytes());
+            put(&mut head, *value, kind.offset());
         }
-        let next = if frame + 1 < frames { head.len() + 8 } else { 0 };
-        head.extend((next as u64).to_le_bytes());
+        let next = if frame + 1 < frames { head.len() + kind.offset() } else { 0 };
+        put(&mut head, next, kind.offset());
     }
-    texts.iter().for_each(|text| head.extend(text));
+    for number in [32_u16, 3] {
+        (0..channels).for_each(|_| head.extend(number.to_le_bytes()));
+    }
+    head.extend(text);
     head.resize(length, 0);
     head
-}
-
-/// The description of a stack in the format of ImageJ.
-fn imagej(clip: &Clip<'_>) -> String {
-    let frames = clip.shape.0;
-    let mut text = format!(
-        "ImageJ=1.54f\nimages={frames}\nframes={frames}\nhyperstack=true\nmode=grayscale\nunit=pixel\n"
-    );
-    if let Some(interval) = clip.interval_s {
-        text += &format!("finterval={interval}\nfps={}\n", 1.0 / interval);
-    }
-    text += "loop=false\n";
-    text
 }
 
 /// The description of a stack in OME-XML (schema of June 2016).
@@ -167,16 +199,31 @@ mod tests {
     use tiff::decoder::{Decoder, DecodingResult};
     use tiff::tags::Tag;
 
-    use super::{Channels, Clip, escape_xml, head};
+    use super::{Channels, Clip, Kind, escape_xml, head, head_of};
 
     #[test]
     fn the_tiff_crate_reads_all_frames() {
         for channels in [Channels::Grey, Channels::Rgb] {
-            assert_readable(channels);
+            for kind in [Kind::Classic, Kind::Big] {
+                assert_readable(kind, channels);
+            }
         }
     }
 
-    fn assert_readable(channels: Channels) {
+    #[test]
+    fn files_above_4_gib_are_big() {
+        let clip = |frames| Clip {
+            name: "",
+            shape: (frames, 1024, 1024),
+            channels: Channels::Grey,
+            interval_s: None,
+            times_s: None,
+        };
+        assert_eq!(head(&clip(1023))[2], 0x2a);
+        assert_eq!(head(&clip(1024))[2], 0x2b);
+    }
+
+    fn assert_readable(kind: Kind, channels: Channels) {
         let (frames, height, width) = (3, 5, 7);
         let times = [0.0, 0.25, 0.5];
         let clip = Clip {
@@ -186,8 +233,8 @@ mod tests {
             interval_s: Some(0.25),
             times_s: Some(&times),
         };
-        let mut file = head(&clip);
         let count = frames * height * width * channels.count();
+        let mut file = head_of(kind, &clip, 4 * count / frames);
         let values: Vec<f32> = (0..count).map(|at| at as f32 - 7.5).collect();
         file.extend(values.iter().flat_map(|value| value.to_le_bytes()));
         let mut decoder = Decoder::new(Cursor::new(file)).unwrap();
