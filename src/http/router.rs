@@ -22,8 +22,8 @@ use super::listen::connection_limit;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
     algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
-    layers, me, measurements, models, pictures, problems, quality, reports, results, samples,
-    session, system, tiles, tus,
+    layers, me, measurements, models, pictures, problems, quality, reference, reports, results,
+    samples, session, system, tiles, tus,
 };
 
 /// Time for which a browser remembers what another origin may do.
@@ -75,6 +75,8 @@ pub fn routes() -> Vec<Route> {
         // Pages and what only they use: no part of the API that clients rely on.
         R::at("/").get(dashboard::page).only(Rule::Public),
         R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
+        R::at("/docs").get(reference::page).only(Rule::Public),
+        R::at("/docs/{file}").get(reference::file).only(Rule::Public),
         R::at("/problems/{code}").get(problems::show).only(Rule::Public),
         R::at("/openapi.yaml").get(contract::yaml).only(Rule::Public),
         R::at("/openapi.json").get(contract::json).only(Rule::Public),
