@@ -114,6 +114,7 @@ pub(super) fn exposed() -> Vec<HeaderName> {
         "tus-checksum-algorithm",
         "upload-offset",
         "upload-length",
+        "upload-defer-length",
         "upload-metadata",
         "upload-expires",
     ];

@@ -291,9 +291,6 @@ async fn concatenation_is_refused_and_a_stalled_piece_is_cut() {
     let part = begin().header("upload-length", "3").header("upload-concat", "partial");
     let detail = app.send(part).await.problem(400, "malformed_request");
     assert!(detail.contains("parallelUploads"), "{detail}");
-    let deferred = begin().header("upload-defer-length", "1");
-    let detail = app.send(deferred).await.problem(400, "malformed_request");
-    assert!(detail.contains("Upload-Length"), "{detail}");
     let created = app.send(begin().header("upload-length", "10")).await.expect(201);
     let place = created.header("location").to_owned();
     let mut socket = TcpStream::connect(app.address()).await.unwrap();
