@@ -51,6 +51,7 @@ mod submissions;
 mod system;
 mod throttle;
 mod tiles;
+mod turnover;
 pub mod tus;
 mod upload;
 mod write_deadline;
