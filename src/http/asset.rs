@@ -80,7 +80,6 @@ impl Asset {
         // The browser revalidates every file, so it never mixes old and new modules after an update.
         set(header::CACHE_CONTROL, "no-cache");
         set(header::VARY, "accept-encoding");
-        set(header::X_CONTENT_TYPE_OPTIONS, "nosniff");
         if gzip && !known {
             set(header::CONTENT_ENCODING, "gzip");
         }
@@ -93,9 +92,8 @@ impl Asset {
     /// As [`Self::answer`], for a page of this service or a file of one, with its content security policy.
     pub(super) fn page(&self, headers: &HeaderMap, policy: &'static str) -> Result<Response> {
         let mut response = self.answer(headers)?;
-        let fields = response.headers_mut();
-        fields.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(policy));
-        fields.insert(header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
+        let policy = HeaderValue::from_static(policy);
+        response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
         Ok(response)
     }
 }
