@@ -111,7 +111,7 @@ CREATE TABLE partials (
     id         TEXT PRIMARY KEY,
     lab        TEXT NOT NULL,
     token      TEXT REFERENCES tokens (id),
-    length     INTEGER NOT NULL CHECK (length > 0), -- bytes of the whole file
+    length     INTEGER CHECK (length > 0), -- bytes of the whole file; NULL until the client states them
     received   INTEGER NOT NULL DEFAULT 0 CHECK (received BETWEEN 0 AND length),
     metadata   TEXT NOT NULL, -- as the client sent it
     expected   TEXT, -- SHA-256 that the client states for the whole file

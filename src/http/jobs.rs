@@ -12,7 +12,7 @@ use strum::VariantArray;
 use super::access::Access;
 use super::app::App;
 use super::context::{RequestContext, changed};
-use super::error::{ApiError, Code, Problem, Result};
+use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
@@ -25,9 +25,6 @@ use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
     NewJob, Page, RequestKey, Span, StoreError,
 };
-
-/// Largest value of `Retry-After` when the queue is full, in seconds.
-const MAX_RETRY_SECONDS: f64 = 600.0;
 
 /// A job with its progress.
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -297,9 +294,7 @@ async fn insert(
     let new = NewJob { most_jobs, lab, spec, key };
     let place = app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new));
     match place.await {
-        Err(full) if full.code() == Code::QueueFull => {
-            Err(full.with_header(header::RETRY_AFTER, next_end(app).await?.into()))
-        }
+        Err(full) if full.code() == Code::QueueFull => Err(full.retry_after(next_end(app).await?)),
         inserted => inserted,
     }
 }

@@ -1,5 +1,7 @@
 // States caused by faults, missing rights, small screens and slow answers.
 
+import { createServer, request as forward } from "node:http";
+import { join } from "node:path";
 import { scene } from "./scene.mjs";
 import { Service } from "./service.mjs";
 
@@ -162,4 +164,38 @@ export async function loading(browser, checks, url) {
   await page.waitForSelector(".calibration .grade.good");
   await checks.look(page, "calibrations");
   await page.context().close();
+}
+
+/** The API reference, directly and below the path prefix of a proxy. */
+export async function reference(browser, checks, url) {
+  const proxy = createServer((request, response) => {
+    const { pathname, search } = new URL(request.url, url);
+    if (!pathname.startsWith("/optics/")) return response.writeHead(404).end();
+    forward(`${url}${pathname.slice("/optics".length)}${search}`, { headers: request.headers }, (answer) => {
+      response.writeHead(answer.statusCode, answer.headers);
+      answer.pipe(response);
+    }).end();
+  });
+  await new Promise((resolve) => proxy.listen(0, "127.0.0.1", resolve));
+  for (const base of [url, `http://127.0.0.1:${proxy.address().port}/optics`]) {
+    const page = await checks.page(await browser.newContext(DESKTOP));
+    const strangers = [];
+    page.on("request", (request) => {
+      if (!request.url().startsWith(`${base}/`) && !/^(data|blob):/.test(request.url())) strangers.push(request.url());
+    });
+    await page.goto(`${base}/`);
+    await page.click("#nav >> text=API");
+    await page.waitForSelector("h1:has-text('sci-recon')");
+    await page.waitForSelector("h2:has-text('Submit a reconstruction')");
+    const text = await page.textContent("body");
+    checks.that(!text.includes("/view/") && !text.includes("/dashboard/"), "the reference shows public operations only");
+    checks.that(text.includes("tile"), "the reference shows the fields of requests");
+    await page.fill("[role=search] input", "cancel");
+    await page.waitForSelector("[data-role='search:results'] >> text=/cancel/i");
+    checks.that((await page.getAttribute("a[download]", "href")) === "openapi.yaml", "the reference links the contract");
+    checks.that(strangers.length === 0, `the reference loads files of this service alone: ${strangers}`);
+    await page.screenshot({ path: join(checks.folder, "reference.png") });
+    await page.context().close();
+  }
+  await new Promise((resolve) => proxy.close(resolve));
 }

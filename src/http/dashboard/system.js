@@ -31,8 +31,8 @@ function service(found) {
     ["Uptime", duration((new Date(found.now) - new Date(found.started_at)) / 1000)],
     ["Largest upload", bytes(found.limits.upload_bytes)],
     ["Memory of a worker", bytes(found.limits.worker_memory_bytes)],
-    ["API description", h("a", { href: "/openapi.yaml" }, "openapi.yaml")],
-    ["Metrics", h("a", { href: "/metrics" }, "metrics for Prometheus")],
+    ["API description", h("a", { href: "openapi.yaml" }, "openapi.yaml")],
+    ["Metrics", h("a", { href: "metrics" }, "metrics for Prometheus")],
   ]));
 }
 

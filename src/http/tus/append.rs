@@ -8,7 +8,10 @@ use crate::http::admission::Reservation;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::upload::{CHUNKS, Pace, next};
-use store::{PartialFile, StoreError};
+use store::{Partial, PartialFile, StoreError};
+
+/// Bytes of a piece between two checks of the quotas.
+const CHECKED_BYTES: u64 = 16 << 20;
 
 /// Appends the body to the file. If the connection breaks, the bytes received until then are kept. A piece with a
 /// checksum is kept only if it is complete and the checksum matches. The file stays locked until the database has the
@@ -21,11 +24,10 @@ pub(super) async fn append(
     body: Body,
 ) -> Result<PartialFile> {
     let has_checksum = checksum.is_some();
-    let length = file.upload().facts.length;
-    let remaining = length - file.upload().received;
+    let upload = file.upload().clone();
     let (sender, receiver) = mpsc::channel(CHUNKS);
     let writer = tokio::task::spawn_blocking(move || write(file, receiver, checksum));
-    let transfer = forward_chunks(app, &mut room, length, remaining, body, sender).await;
+    let transfer = forward_chunks(app, &mut room, &upload, body, sender).await;
     let mut written = writer.await.map_err(|_| StoreError::Interrupted)??;
     match (&transfer, written.checksum_matches) {
         (Err(_), _) if has_checksum => {}
@@ -43,25 +45,37 @@ pub(super) async fn append(
     transfer.map(|()| written.file)
 }
 
-/// Passes the chunks of the body to the writer. `remaining` is the number of bytes that the upload still needs.
+/// Passes the chunks of the body to the writer.
 ///
-/// Errors: 413 if the body is longer.
+/// Errors: 413 if the body is longer than the rest of the upload; 403 if an upload of unknown length exceeds a quota.
 async fn forward_chunks(
     app: &App,
     room: &mut Reservation,
-    length: u64,
-    mut remaining: u64,
+    upload: &Partial,
     body: Body,
     sender: mpsc::Sender<Bytes>,
 ) -> Result<()> {
+    let facts = &upload.facts;
     let mut stream = body.into_data_stream();
     let mut pace = Pace::default();
+    let (mut bytes, mut next_check) = (0, 0);
     while let Some(chunk) = next(app, &mut pace, &mut stream).await? {
-        let Some(rest) = remaining.checked_sub(chunk.len() as u64) else {
-            let detail = format!("the upload was created with {length} bytes; the body is longer");
-            return Err(ApiError::new(Code::TooLarge, detail));
-        };
-        remaining = rest;
+        bytes += chunk.len() as u64;
+        match facts.length {
+            Some(length) if bytes > length - upload.received => {
+                let detail = format!("the upload has {length} bytes; the body is longer");
+                return Err(ApiError::new(Code::TooLarge, detail));
+            }
+            Some(_) => {}
+            None => {
+                app.admission.check_size(upload.received + bytes)?;
+                // The store decides in the end. This check ends a body early that can't be accepted.
+                if bytes > next_check {
+                    app.store.check_quota(&facts.lab, facts.token, bytes).await?;
+                    next_check = bytes + CHECKED_BYTES;
+                }
+            }
+        }
         app.admission.take(room, chunk.len() as u64).await?;
         // A closed channel means that the writer failed. The caller reports the writer's error.
         if sender.send(chunk).await.is_err() {
