@@ -280,6 +280,7 @@ KINDS = [
     Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
 
     Kind('masks of another calibration', ('foreign_masks',), with_masks(lambda s: s.other), masks=True),
+    Kind('inverted masks (1 - C)', ('inverted_masks',), with_masks(lambda s: 1 - s.masks), masks=True),
     Kind('masks flipped from left to right', ('turned_masks',), with_masks(lambda s: s.masks[:, :, ::-1]), masks=True),
     Kind('masks flipped upside down', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1]), masks=True),
     Kind('masks turned by 180 degrees', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1, ::-1]), masks=True),
@@ -348,7 +349,7 @@ class Bench:
             for name, array in arrays.items():
                 np.save(folder / f'{name}.npy', array)
             command = [self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
-                       '--truth-full-scale', '1', '--measurement-full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
+                       '--truth-full-scale', '1', '--full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
                        '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
             done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             if done.returncode == 2:

@@ -4,6 +4,7 @@ use std::fmt::Display;
 use std::path::Path;
 use std::process::ExitCode;
 
+use super::fields::{Role, as_options};
 use super::serve::ServeError;
 use engine::intake::IntakeError;
 use engine::pipeline::PipelineError;
@@ -37,6 +38,14 @@ impl CliError {
             Self::Failure(_) => ExitCode::FAILURE,
             Self::ErrorsFound(_) => ExitCode::from(3),
             Self::Unread => ExitCode::SUCCESS,
+        }
+    }
+
+    /// The error with the options of the command line in place of the fields of the API.
+    pub(super) fn about(self, role: Role) -> Self {
+        match self {
+            Self::Input(text) => Self::Input(as_options(&text, role)),
+            other => other,
         }
     }
 

@@ -33,6 +33,7 @@ pub mod check_model;
 pub mod cluster;
 pub mod demo;
 pub mod fetch;
+mod fields;
 pub mod health;
 pub mod job;
 pub mod lab;

@@ -15,6 +15,7 @@ use super::CliError;
 use super::arguments::{
     NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic, packing, sequence,
 };
+use super::fields::Role;
 use super::model::{Model, cut};
 use super::output::print_line;
 use super::progress::SnapshotBar;
@@ -80,8 +81,8 @@ pub struct Arguments {
     masks_full_scale: Option<f32>,
     /// Value in the measurement's file that means 1 [default: 255 for uint8 and .mat scenes,
     /// 65535 for uint16, 1 for floats].
-    #[arg(long, value_name = "VALUE")]
-    measurement_full_scale: Option<f32>,
+    #[arg(long, alias = "measurement-full-scale", value_name = "VALUE")]
+    full_scale: Option<f32>,
     /// Value in the truth's file that means 1 [default: as for the measurement].
     #[arg(long, value_name = "VALUE")]
     truth_full_scale: Option<f32>,
@@ -89,6 +90,12 @@ pub struct Arguments {
     /// colours ([frame, row, column, 3]) or be a mosaic [default: a grey sensor].
     #[arg(long, value_name = "NAME", value_parser = mosaic())]
     mosaic: Option<Mosaic>,
+    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
+    #[arg(long, value_name = "NAME")]
+    masks_array: Option<String>,
+    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
+    #[arg(long, value_name = "NAME")]
+    array: Option<String>,
     /// The order of the axes in the masks' file [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     masks_axes: Option<Axes>,
@@ -102,14 +109,14 @@ pub struct Arguments {
     #[arg(long, value_name = "NAME", value_parser = packing())]
     masks_packing: Option<Packing>,
     /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
-    #[arg(long, value_name = "WINDOW")]
-    measurement_crop: Option<Crop>,
+    #[arg(long, alias = "measurement-crop", value_name = "WINDOW")]
+    crop: Option<Crop>,
     /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
-    #[arg(long, value_name = "NAME", value_parser = packing())]
-    measurement_packing: Option<Packing>,
+    #[arg(long, alias = "measurement-packing", value_name = "NAME", value_parser = packing())]
+    packing: Option<Packing>,
     /// The order of the axes in the measurement's file.
-    #[arg(long, value_name = "ORDER", value_parser = axes())]
-    measurement_axes: Option<Axes>,
+    #[arg(long, alias = "measurement-axes", value_name = "ORDER", value_parser = axes())]
+    axes: Option<Axes>,
     /// The order of the axes in the truth's file.
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     truth_axes: Option<Axes>,
@@ -246,7 +253,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
     }
     report.print(arguments)?;
-    verdict::refuse_errors([&*report.findings])
+    verdict::refuse_bad([(&*report.findings, report.assessment.as_ref())])
 }
 
 /// The output folder of each snapshot.
@@ -287,6 +294,7 @@ impl<'a> Sources<'a> {
                 SceneArray::Masks,
                 arguments.masks_full_scale,
             )
+            .named(arguments.masks_array.clone())
             .arranged(arguments.masks_axes, None)
             .part(
                 Part { crop: arguments.masks_crop, frames: arguments.masks_frames },
@@ -295,13 +303,11 @@ impl<'a> Sources<'a> {
             measurement: Source::file(
                 named(&arguments.measurement).ok_or_else(missing)?,
                 SceneArray::Measurements,
-                arguments.measurement_full_scale,
+                arguments.full_scale,
             )
-            .arranged(arguments.measurement_axes, None)
-            .part(
-                Part { crop: arguments.measurement_crop, frames: None },
-                arguments.measurement_packing,
-            ),
+            .named(arguments.array.clone())
+            .arranged(arguments.axes, None)
+            .part(Part { crop: arguments.crop, frames: None }, arguments.packing),
             truth: named(&arguments.truth).map(|path| {
                 Source::file(path, SceneArray::Truth, arguments.truth_full_scale)
                     .arranged(arguments.truth_axes, None)
@@ -330,7 +336,8 @@ struct Input<'a> {
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let mut sources = Sources::new(arguments)?;
-        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())?;
+        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())
+            .map_err(|error| CliError::from(error).about(Role::Masks))?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
         if let Some(truth) = &mut sources.truth {
@@ -342,20 +349,21 @@ impl<'a> Input<'a> {
         let behind =
             Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
         masks.array.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
-        let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))?;
+        let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))
+            .map_err(|error| CliError::from(error).about(Role::Measurement))?;
         let (measurement, snapshots) = (read.measurement, read.count);
         let (count, rows, columns) = measurement.array.dim();
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
                 "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
                  {height}x{width}; both must have the same height and width: state the window that they have in \
-                 common as --masks-crop or --measurement-crop",
+                 common as --masks-crop or --crop",
                 sources.measurement.path.display(),
                 sources.masks.path.display(),
             )));
         }
         let mosaic = arguments.mosaic;
-        let crops = [arguments.masks_crop, arguments.measurement_crop];
+        let crops = [arguments.masks_crop, arguments.crop];
         if mosaic.is_some() && !crops.into_iter().all(keeps_mosaic) {
             let text = "--mosaic: the window of a mosaic starts at an even row and an even column";
             return Err(CliError::Input(text.into()));

@@ -1,6 +1,6 @@
 //! The options of `submit` and `watch-folder`, and the requests that follow from them.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use serde_json::{Map, Value, json};
@@ -8,6 +8,7 @@ use serde_json::{Map, Value, json};
 use super::CliError;
 use super::arguments::{Snapshots, axes, frame_range, mosaic, named_all, packing, sequence};
 use super::client::{Client, Result};
+use super::fields::Role;
 use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
 use formats::{Axes, Crop, Packing};
 
@@ -20,7 +21,7 @@ pub(super) struct SubmissionArguments {
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
-    /// Name of the masks in an npz, .mat or HDF5 file [default: mask].
+    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_array: Option<String>,
     /// The order of the axes of the masks [default: the only one that fits].
@@ -51,7 +52,7 @@ pub(super) struct SubmissionArguments {
     /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     bad_pixels: Option<PathBuf>,
-    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas].
+    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
     #[arg(long, value_name = "NAME", help_heading = MEASUREMENT)]
     array: Option<String>,
     /// The order of the axes of the snapshots [default: the only one that fits].
@@ -146,7 +147,8 @@ impl SubmissionArguments {
                     self.calibration_request(client.upload_with_bar(masks).await?, bad_pixels);
                 // One file of masks creates one calibration for all clients.
                 let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-                client.create_checked("/v1/calibrations", &body, &key).await?
+                let created = client.create_checked("/v1/calibrations", &body, &key).await;
+                created.map_err(|error| error.about(Role::Masks, masks))?
             }
             (None, None) => {
                 let text = "give --masks FILE or --calibration ID";
@@ -231,18 +233,19 @@ fn add(request: &mut Map<String, Value>, name: &str, value: Value) {
 }
 
 impl Recipe {
-    /// Creates a measurement and a job from uploaded data. `label` is the default label. The same key returns the same job.
+    /// Creates a measurement and a job from a file that was uploaded. `label` is the default label. The same key returns the same job.
     pub(super) async fn submit(
         &self,
         client: &Client,
-        data: Sha256,
+        (file, data): (&Path, Sha256),
         label: Option<&str>,
         key: &str,
     ) -> Result<Value> {
         let mut measurement = self.measurement.clone();
         measurement.insert("data".to_owned(), json!(data));
         let body = Value::Object(measurement);
-        let measurement = client.create_checked("/v1/measurements", &body, key).await?;
+        let created = client.create_checked("/v1/measurements", &body, key).await;
+        let measurement = created.map_err(|error| error.about(Role::Measurement, file))?;
         let mut job = self.job.clone();
         job.insert("measurement".to_owned(), json!(measurement));
         if !job.contains_key("label") {

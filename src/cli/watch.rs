@@ -83,5 +83,6 @@ fn report(jobs: &[Job], as_json: bool) -> Result<()> {
         return Err(CliError::Failure(failures.join("; ")));
     }
     let findings: Vec<_> = jobs.iter().map(Job::findings).collect();
-    verdict::refuse_errors(findings.iter().map(Vec::as_slice))
+    let assessments = jobs.iter().map(|job| job.assessment.as_ref());
+    verdict::refuse_bad(findings.iter().map(Vec::as_slice).zip(assessments))
 }

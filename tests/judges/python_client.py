@@ -8,6 +8,7 @@ import json
 import os
 import re
 import sys
+import warnings
 from base64 import b64decode
 from pathlib import Path
 
@@ -21,13 +22,18 @@ from sci_recon import ApiError, Client
 def napari(result):
     """Opens the job by its addresses, and a folder of results, as napari does."""
     manager = npe2.PluginManager.instance()
-    manifest = npe2.PluginManifest.from_file(Path(sci_recon.__file__).parent / "napari.yaml")
+    manifest = npe2.PluginManifest.from_file(
+        Path(sci_recon.__file__).parent / "napari.yaml"
+    )
     manifest.validate_imports()
     manager.register(manifest)
     folder = result.download("frames.npy", result.snapshots[0]).parent
     (folder / "manifest.json").write_text(json.dumps(result.manifest))
     url, job = os.environ["SCI_RECON_URL"], result.job
-    expected = {f"{url}/v1/jobs/{job.id}": result.frames, f"{url}/#/jobs/{job.id}": result.frames}
+    expected = {
+        f"{url}/v1/jobs/{job.id}": result.frames,
+        f"{url}/#/jobs/{job.id}": result.frames,
+    }
     expected[str(folder)] = result.snapshot(result.snapshots[0])
     for path, frames in expected.items():
         [(data, settings, kind)] = npe2.read([path], stack=False)
@@ -51,34 +57,90 @@ def jupyter(result):
     assert abs(picture.width / picture.height - width / height) < 0.02, picture
 
 
+def unreachable():
+    """A service that is down is named at once, and an unknown host ends the call."""
+    sci_recon._transfer.TRIES = 2
+    for url, count in [("http://127.0.0.1:9", 1), ("http://no.such.host.invalid", 0)]:
+        with warnings.catch_warnings(record=True) as issued, Client(url) as client:
+            warnings.simplefilter("always")
+            try:
+                list(client.jobs())
+                raise AssertionError("there is no service")
+            except sci_recon.SciReconError as error:
+                assert url in str(error), error
+        assert [warning.category for warning in issued] == [
+            sci_recon.ConnectionWarning
+        ] * count, (url, issued)
+
+
 def main():
     folder = Path(sys.argv[1])
     masks = np.load(folder / "masks.npy")
     with Client() as client:
-        result = client.reconstruct(masks, folder / "measurement.npy", "gap-tv", folder=folder / "result")
+        result = client.reconstruct(
+            masks, folder / "measurement.npy", "gap-tv", folder=folder / "result"
+        )
         frames = result.frames
         snapshots, count = len(result.snapshots), len(masks)
-        assert frames.shape == (snapshots * count, *masks.shape[1:]) and frames.dtype == np.float32
+        assert (
+            frames.shape == (snapshots * count, *masks.shape[1:])
+            and frames.dtype == np.float32
+        )
         measurement = np.load(folder / "measurement.npy")
         for snapshot in range(snapshots):
             again = (masks * frames[snapshot * count :][:count]).sum(axis=0)
-            difference = np.linalg.norm(again - measurement[snapshot]) / np.linalg.norm(measurement[snapshot])
-            assert difference < 0.05, f"snapshot {snapshot} does not fit its measurement: {difference}"
+            difference = np.linalg.norm(again - measurement[snapshot]) / np.linalg.norm(
+                measurement[snapshot]
+            )
+            assert difference < 0.05, (
+                f"snapshot {snapshot} does not fit its measurement: {difference}"
+            )
         stack = result.download("stack.exr", snapshot=1)
         assert stack.read_bytes()[:4] == bytes([0x76, 0x2F, 0x31, 0x01])
-        error, blocks = result.expected_error(1), np.load(result.download("error.npy", snapshot=1))
+        error, blocks = (
+            result.expected_error(1),
+            np.load(result.download("error.npy", snapshot=1)),
+        )
         k, i, j = np.indices(result.snapshot(1).shape)
         assert (error == blocks[k, i // 16, j // 16]).all()
-        assert result.assessment == client.job(result.job.id).record["assessment"] is not None
+        assert (
+            result.assessment
+            == client.job(result.job.id).record["assessment"]
+            is not None
+        )
         assert result.movie(format="gif").read_bytes()[:6] == b"GIF89a"
         for movie in (result.movie(), result.movie(snapshot=1)):
-            assert movie.read_bytes()[4:8] == b"ftyp" and movie.parent.parent == folder / "result"
+            assert (
+                movie.read_bytes()[4:8] == b"ftyp"
+                and movie.parent.parent == folder / "result"
+            )
         assert not list(stack.parent.glob("*.part"))
         assert result.manifest["content"]["schedule"]
         text = repr(result)
-        assert result.job.verdict in text and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text, text
+        assert (
+            result.job.verdict in text
+            and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text
+        ), text
         napari(result)
         jupyter(result)
+        assert result.download("stack.tif", snapshot=1).read_bytes()[:2] == b"II"
+        with warnings.catch_warnings(record=True) as issued:
+            warnings.simplefilter("always")
+            wrong = client.reconstruct(masks[:, ::-1], measurement, "gap-tv")
+        found = [
+            str(warning.message)
+            for warning in issued
+            if warning.category is sci_recon.FindingWarning
+        ]
+        assert found and all("Remedy: " in text for text in found), issued
+        assert len({text.split(":")[0] for text in found}) == len(found), (
+            "a line for each finding"
+        )
+        code = wrong.job.findings[0]["code"]
+        assert (
+            code in found[0] and code in repr(wrong) and code in wrong._repr_html_()
+        ), (found, wrong)
+        wrong.job.delete()
         # A rejection raises the service's message, without a retry.
         try:
             client.reconstruct(masks * 3, measurement, "gap-tv")
@@ -88,7 +150,10 @@ def main():
             assert str(error).count("above the full scale") == 1, error
         # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
-        assert later.state == "succeeded" and [job.id for job in client.jobs()] == [later.id]
+        assert later.state == "succeeded" and later.id in [
+            job.id for job in client.jobs()
+        ]
+        unreachable()
         print(json.dumps({"job": later.id, "frames": list(frames.shape)}))
 
 

@@ -283,6 +283,7 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     let errors = stderr.lines().filter(|line| line.starts_with("error ")).count();
     assert!(errors > 0 && stderr.matches("Remedy: ").count() >= errors, "{stderr}");
     assert!(stderr.contains("the checks found"), "{stderr}");
+    assert!(!stderr.contains("`axes`") && !stderr.contains("`full_scale`"), "{stderr}");
     let job = String::from_utf8(submitted.stdout).unwrap().trim().to_owned();
 
     let watched = lab.run(&["watch", &job]).await;

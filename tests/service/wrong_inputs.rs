@@ -55,6 +55,15 @@ fn the_right_input_has_a_figure_and_no_finding_on_the_masks() {
 }
 
 #[test]
+fn inverted_masks_are_named_first() {
+    let (masks, y) = scene();
+    let inverted: Vec<f32> = masks.iter().map(|mask| 1.0 - mask).collect();
+    let (assessment, codes) = reconstruct(&inverted, &y);
+    assert_eq!(codes[0], "inverted_masks", "{codes:?}");
+    assert_eq!(assessment["psnr_db"], Value::Null, "{assessment}");
+}
+
+#[test]
 fn masks_of_another_orientation_are_named() {
     let (masks, y) = scene();
     let turned = |place: &dyn Fn(usize, usize) -> (usize, usize)| -> Vec<f32> {

@@ -75,6 +75,7 @@ pub enum FindingCode {
     DriftedMasks,
     TurnedMasks,
     ForeignMasks,
+    InvertedMasks,
     FastMotion,
     UnfamiliarMasks,
     UnevenError,
@@ -277,14 +278,14 @@ impl FindingCode {
                 Warning,
                 Warning,
                 "12-bit values are left-aligned in 16 bits",
-                "state 65520 as `full_scale` and as `saturation`",
+                "state 65520 as `saturation`; the `full_scale` is the number that one frame adds, at most 65520",
             ),
             Self::RightAligned => (
                 &[Measurement],
                 Warning,
                 Warning,
                 "12-bit values are right-aligned in 16 bits",
-                "if the camera has 12 bits, state 4095 as `full_scale` and as `saturation`",
+                "if the camera has 12 bits, state 4095 as `saturation`; the `full_scale` is the number that one frame adds, at most 4095",
             ),
             Self::Level => (
                 &[Measurement, Result],
@@ -359,6 +360,13 @@ impl FindingCode {
                 Error,
                 "the masks do not explain the measurement",
                 "name the calibration that belongs to this measurement, or calibrate again",
+            ),
+            Self::InvertedMasks => (
+                &[Measurement],
+                Error,
+                Error,
+                "the masks are inverted: open pixels are 0, closed ones 1",
+                "send 1 - C as the masks, and make the calibration again",
             ),
             Self::FastMotion => (
                 &[Result],

@@ -29,7 +29,7 @@ use super::output::print_line;
 use super::submission::{Recipe, SubmissionArguments};
 use super::verdict;
 use super::wait::wait;
-use engine::job::{Finding, JobState};
+use engine::job::{Assessment, Finding, JobState};
 use ledger::{Entry, Ledger, Shot, Stage};
 
 /// Extensions of files that may hold snapshots. The service detects the format by the content.
@@ -90,14 +90,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             ledger,
             growing: HashMap::new(),
             failed: 0,
-            findings: Vec::new(),
+            results: Vec::new(),
         };
         watch.run().await?;
         if watch.failed > 0 {
             let text = format!("{} files have failed; see their .failed.txt", watch.failed);
             return Err(CliError::Failure(text));
         }
-        verdict::refuse_errors([&*watch.findings])
+        let results = watch.results.iter();
+        verdict::refuse_bad(
+            results.map(|(findings, assessment)| (&**findings, assessment.as_ref())),
+        )
     })
 }
 
@@ -113,8 +116,8 @@ struct Watch<'a> {
     growing: HashMap<Shot, Instant>,
     /// Files that have failed since the start.
     failed: usize,
-    /// Findings of the jobs that have ended since the start.
-    findings: Vec<Finding>,
+    /// Findings and assessments of the jobs that have ended since the start.
+    results: Vec<(Vec<Finding>, Option<Assessment>)>,
 }
 
 impl Watch<'_> {
@@ -239,7 +242,8 @@ impl Watch<'_> {
         }
         self.arguments.submission.send_dark(&self.client).await?;
         let label: String = entry.shot.name.chars().take(200).collect();
-        let job = entry.recipe.submit(&self.client, data, Some(&label), &entry.key).await?;
+        let job =
+            entry.recipe.submit(&self.client, (&path, data), Some(&label), &entry.key).await?;
         Ok(Some(Stage::Submitted { job: Job::new(job)?.id }))
     }
 
@@ -284,7 +288,7 @@ impl Watch<'_> {
             job.algorithm,
             job.created_at,
         );
-        self.findings.extend(findings);
+        self.results.push((findings, job.assessment.clone()));
         fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
         write_new(&folder.join(REPORT), &text)
     }

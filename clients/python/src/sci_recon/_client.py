@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _transfer as transfer
-from ._errors import ApiError, CalibrationFailed, JobFailed
+from ._errors import ApiError, CalibrationFailed, FindingWarning, JobFailed
 from ._transfer import Source
 
 Record = dict[str, Any]
@@ -30,6 +30,8 @@ Snapshots = Literal["all"] | int | tuple[int, int]
 ENDED = {"succeeded", "failed", "cancelled"}
 # Side of the blocks of error.npy in pixels.
 BLOCK = 16
+# Files that the service composes on demand, and their exports.
+EXPORTS = {"stack.tif": "tiff", "stack-sigma.exr": "exr?layers=sigma"}
 
 
 class Client:
@@ -115,7 +117,7 @@ class Client:
         the axes fit, state "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a `mosaic`:
         "rggb", "bggr", "grbg" or "gbrg". The average of the `dark` captures is subtracted. The other arguments are those
         of `calibrate`, `measure` and `submit`. The frames are saved in `folder`, by default a temporary folder that exists
-        as long as the result. Findings with severity "error" are issued as Python warnings, with their remedies.
+        as long as the result. Findings of the checks are issued as Python warnings (`FindingWarning`), with their remedies.
         """
         if isinstance(masks, Calibration):
             calibration = masks
@@ -160,10 +162,8 @@ class Client:
             webhook=webhook,
             key=key,
         ).wait()
-        for finding in job.findings:
-            if finding["severity"] == "error":
-                warnings.warn(describe(finding), stacklevel=2)
-        return job.result(folder)
+        job.warn(stacklevel=3)
+        return Result(job, folder)
 
     def calibrate(
         self,
@@ -501,8 +501,17 @@ class Job(Entity):
         transfer.send(self.client.http, "DELETE", f"/v1/jobs/{self.id}")
 
     def result(self, folder: str | os.PathLike[str] | None = None) -> Result:
-        """The results of the job. Files are downloaded on first use into `folder`, by default a temporary folder."""
+        """The results of the job. Files are downloaded on first use into `folder`, by default a temporary folder.
+
+        The findings are issued as Python warnings (`FindingWarning`), with their remedies.
+        """
+        self.warn(stacklevel=3)
         return Result(self, folder)
+
+    def warn(self, stacklevel: int = 2) -> None:
+        """Issues the findings as Python warnings."""
+        for line in describe_all(self.findings):
+            warnings.warn(line, FindingWarning, stacklevel=stacklevel)
 
 
 class Result:
@@ -519,11 +528,14 @@ class Result:
         shape = self.job.record["shape"]
         frames = len(self.snapshots) * shape["frames"]
         name = self.job.record.get("label") or self.job.id
-        return f"<Result {name!r}: {self.job.verdict}; {frames} frames of {shape['height']}x{shape['width']}>"
+        codes = ", ".join(dict.fromkeys(f"{finding['severity']} {finding['code']}" for finding in self.job.findings))
+        found = f"; {codes}" if codes else ""
+        return f"<Result {name!r}: {self.job.verdict}{found}; {frames} frames of {shape['height']}x{shape['width']}>"
 
     def _repr_html_(self) -> str:
-        """HTML for Jupyter: name, verdict, and an animated preview if Pillow is installed."""
-        text = f"<p>{html.escape(repr(self))}</p>"
+        """HTML for Jupyter: name, verdict, findings, and an animated preview if Pillow is installed."""
+        findings = "".join(f"<li>{html.escape(line)}</li>" for line in describe_all(self.job.findings))
+        text = f"<p>{html.escape(repr(self))}</p>" + (f"<ul>{findings}</ul>" if findings else "")
         try:
             picture = preview(self.snapshot(self.snapshots[0]))
         except ImportError:
@@ -566,12 +578,14 @@ class Result:
         return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]
 
     def download(self, name: str, snapshot: int | None = None) -> Path:
-        """Downloads a file such as `stack.exr`, `frames.npy` or `frames/frame_0001.exr`, unless the folder has it."""
+        """Downloads a file such as `stack.exr`, `stack.tif`, `frames.npy` or `frames/frame_0001.exr`, unless the folder has it."""
         index = self.snapshots[0] if snapshot is None else snapshot
+        if export := EXPORTS.get(name):
+            return self._export(f"snapshots/{index}/exports/{export}", self.folder / f"snapshot_{index:04d}" / name)
         listed = self.job.client._get(f"/v1/jobs/{self.job.id}/snapshots/{index}")["files"]
         files = {file["name"]: file for file in listed if file["href"]}
         if name not in files:
-            raise KeyError(f"snapshot {index} has no file {name!r}; its files are {', '.join(files)}")
+            raise KeyError(f"snapshot {index} has no file {name!r}; its files are {', '.join([*files, *EXPORTS])}")
         file = files[name]
         path = self.folder / f"snapshot_{index:04d}" / name
         if not (path.is_file() and transfer.sha256(path) == file["sha256"]):
@@ -600,15 +614,35 @@ class Result:
                 transfer.download(http, href, path, sha256, bar)
         return path
 
+    def _export(self, href: str, path: Path) -> Path:
+        """Downloads a file that the service composes of stored ones. Its ETag identifies the content."""
+        http, href = self.job.client.http, f"/v1/jobs/{self.job.id}/{href}"
+        etag = transfer.send(http, "HEAD", href).headers["ETag"].strip('"')
+        if not path.is_file():
+            with self.job.client._bar(f"download {path.name}") as bar:
+                transfer.download(http, href, path, etag, bar, composed=True)
+        return path
+
     @property
     def manifest(self) -> Record:
         """The manifest of the job: inputs, parameters and results."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
 
 
-def describe(finding: Record) -> str:
-    """A finding as one line, with its remedy."""
-    place = f"snapshot {finding['snapshot']}: " if finding.get("snapshot") is not None else ""
+def describe_all(findings: Sequence[Record]) -> list[str]:
+    """Findings as lines with their remedies. Findings with the same code about several snapshots share a line."""
+    groups: dict[tuple[str, bool], list[Record]] = {}
+    for finding in findings:
+        groups.setdefault((finding["code"], finding.get("snapshot") is not None), []).append(finding)
+    return [
+        describe(group[0], [finding["snapshot"] for finding in group if finding.get("snapshot") is not None])
+        for group in groups.values()
+    ]
+
+
+def describe(finding: Record, snapshots: Sequence[int]) -> str:
+    numbers = ", ".join(map(str, snapshots[:9])) + (f" and {len(snapshots) - 9} more" if len(snapshots) > 9 else "")
+    place = f"snapshot{'s' if len(snapshots) > 1 else ''} {numbers}: " if snapshots else ""
     detail, remedy = finding["detail"].rstrip("."), finding["remedy"].rstrip(".")
     return f"{finding['severity']} {finding['code']}: {place}{detail}. Remedy: {remedy}."
 

@@ -16,12 +16,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ._client import Client, Job, Result, describe
+from ._client import Client, Job, Result, describe_all
 from ._errors import ApiError, JobFailed, SciReconError
 
 ENDINGS = {".npy", ".tif", ".tiff", ".png", ".mat", ".h5", ".hdf5"}
 LEDGER = ".sci-recon-watch.json"
+# The ledger of `sci-recon watch-folder`.
+OTHER_LEDGER = ".sci-recon.ledger"
 ENDED = {"succeeded", "failed", "cancelled"}
+FILES = ("frames.npy", "stack.tif", "manifest.json")
 
 # Submits a file with an idempotency key.
 Submit = Callable[[Path, str], Job]
@@ -39,7 +42,7 @@ class Watch:
         folder: str | os.PathLike[str],
         submit: Submit,
         *,
-        files: Sequence[str] = ("frames.npy", "manifest.json"),
+        files: Sequence[str] = FILES,
         own: Sequence[str | os.PathLike[str]] = (),
         settle_seconds: float = 3.0,
     ) -> None:
@@ -49,6 +52,12 @@ class Watch:
         self.files = files
         self.own = {Path(file).resolve() for file in own}
         self.settle_seconds = settle_seconds
+        self.failed = 0
+        self.doubtful = 0
+        if (self.folder / OTHER_LEDGER).exists():
+            raise SciReconError(
+                f"{self.folder} is watched by `sci-recon watch-folder`: use one of both, or remove {OTHER_LEDGER}"
+            )
         ledger = self.folder / LEDGER
         self.done: dict[str, str] = json.loads(ledger.read_text("utf-8")) if ledger.exists() else {}
         self.jobs: dict[str, tuple[Path, Job]] = {}
@@ -56,7 +65,8 @@ class Watch:
         self.settling: dict[str, float] = {}
 
     def run(self, once: bool = False) -> None:
-        """Watches until it is interrupted. With `once` it returns when all files are processed."""
+        """Watches until it is interrupted. With `once` it returns when all files are processed; `failed` and `doubtful` are
+        the numbers of files that failed, and of those with errors found by the checks."""
         while True:
             self.look()
             if once and not self.jobs and not self.settling:
@@ -119,16 +129,19 @@ class Watch:
         for snapshot in result.snapshots:
             for name in self.files:
                 result.download(name, snapshot)
-        lines = [f"{path.name}: {job.verdict}", "", *map(describe, job.findings), "", f"job {job.id}"]
+        findings = describe_all(job.findings)
+        lines = [f"{path.name}: {job.verdict}", "", *findings, "", f"job {job.id}"]
         draft.mkdir(exist_ok=True)
         (draft / "REPORT.txt").write_text("\n".join(lines) + "\n", "utf-8")
         folder = draft.rename(self._unused(path, ".result"))
         print(f"{path.name} is in {folder.name}: {job.verdict}", flush=True)
-        for finding in job.findings:
-            print(f"    {describe(finding)}", flush=True)
+        for line in findings:
+            print(f"    {line}", flush=True)
+        self.doubtful += any(finding["severity"] == "error" for finding in job.findings)
         self._record(key, folder.name)
 
     def _fail(self, key: str, path: Path, error: Exception) -> None:
+        self.failed += 1
         report = self._unused(path, ".failed.txt")
         report.write_text(f"{path.name}: {error}\n\nTo try again, save the file again.\n", "utf-8")
         print(f"{path.name} has failed: {error}", flush=True)

@@ -26,8 +26,8 @@ const SNAPSHOTS: usize = 8;
 /// ones, which looks like light that the masks do not explain.
 pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding> {
     use FindingCode::{
-        BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, Level, MaskScale, NegativeOffset,
-        NoDark, Saturated, ShiftedMasks, TurnedMasks, WrongDark,
+        BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, InvertedMasks, Level, MaskScale,
+        NegativeOffset, NoDark, Saturated, ShiftedMasks, TurnedMasks, WrongDark,
     };
     let is_one_of =
         |finding: &Finding, codes: &[FindingCode]| codes.iter().any(|code| finding.is(*code));
@@ -35,7 +35,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
         let found = findings.iter().filter(|finding| is_one_of(finding, codes));
         found.map(|finding| finding.snapshot).collect()
     };
-    let wrong_masks = [BinaryMeasurement, ShiftedMasks, TurnedMasks, ForeignMasks];
+    let wrong_masks = [BinaryMeasurement, InvertedMasks, ShiftedMasks, TurnedMasks, ForeignMasks];
     let with_wrong_masks = snapshots_with(&judged, &wrong_masks);
     let copies = snapshots_with(&judged, &[BinaryMeasurement]);
     read.retain(|finding| match finding {
@@ -57,6 +57,8 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
     findings.extend(read);
     findings.extend(others);
     findings.extend(bad_pixels);
+    // A copy of masks has no scale of its own.
+    findings.sort_by_key(|finding| !finding.is(BinaryMeasurement));
     findings
 }
 

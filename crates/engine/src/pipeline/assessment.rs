@@ -186,6 +186,8 @@ pub fn expected(
     reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
     reasons.extend(unfamiliar.then(unfamiliar_masks_finding));
+    // An uneven error is an effect of the other causes.
+    reasons.sort_by_key(|reason| reason.is(FindingCode::UnevenError));
     let stated = |decibels| (!is_in_doubt(&reasons)).then(|| Assessment::round(decibels));
     let assessment = Assessment {
         grade: grade((psnr_db, high), &reasons),
@@ -202,16 +204,17 @@ pub fn expected(
 /// knows only results with the right ones.
 fn is_in_doubt(findings: &[Finding]) -> bool {
     use FindingCode::{
-        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks, MaskScale,
-        MissingPattern, Mosaic, Negative, NegativeOffset, NoDark, ShiftedMasks, TurnedMasks,
-        UnexplainedPixels, WrongDark,
+        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
+        InvertedMasks, MaskScale, MissingPattern, Mosaic, Negative, NegativeOffset, NoDark,
+        ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
     };
-    const DOUBTS: [FindingCode; 15] = [
+    const DOUBTS: [FindingCode; 16] = [
         BadCalibration,
         BinaryMeasurement,
         DriftedMasks,
         ExchangedMasks,
         ForeignMasks,
+        InvertedMasks,
         MaskScale,
         MissingPattern,
         Mosaic,
