@@ -21,6 +21,17 @@ pub struct Clip<'a> {
     pub interval_s: Option<f64>,
     /// Start of each frame in seconds, if known.
     pub times_s: Option<&'a [f64]>,
+    /// The bands of a spectral image, for frames that are its bands. The frames of several images follow one another.
+    pub bands: Option<Bands<'a>>,
+}
+
+/// The bands of a spectral image.
+#[derive(Debug, Clone, Copy)]
+pub struct Bands<'a> {
+    /// Number of bands.
+    pub count: usize,
+    /// Wavelength of each band in nanometres, if known.
+    pub wavelengths_nm: Option<&'a [f64]>,
 }
 
 /// Byte order, version, size of offsets, and offset of the first directory.
@@ -98,9 +109,12 @@ pub fn head(clip: &Clip<'_>) -> Vec<u8> {
 
 /// The description of a stack in the format of ImageJ.
 fn imagej(clip: &Clip<'_>) -> String {
-    let frames = clip.shape.0;
+    let images = clip.shape.0;
+    let channels = clip.bands.map_or(1, |bands| bands.count.max(1));
+    let frames = images / channels;
+    let bands = clip.bands.map_or(String::new(), |_| format!("channels={channels}\n"));
     let mut text = format!(
-        "ImageJ=1.54f\nimages={frames}\nframes={frames}\nhyperstack=true\nmode=grayscale\nunit=pixel\n"
+        "ImageJ=1.54f\nimages={images}\n{bands}frames={frames}\nhyperstack=true\nmode=grayscale\nunit=pixel\n"
     );
     if let Some(interval) = clip.interval_s {
         text += &format!("finterval={interval}\nfps={}\n", 1.0 / interval);
@@ -123,6 +137,20 @@ fn ome(clip: &Clip<'_>) -> String {
             "<Plane TheZ=\"0\" TheT=\"{frame}\" TheC=\"0\" DeltaT=\"{time}\" DeltaTUnit=\"s\"/>"
         );
     }
+    let bands = clip.bands.map_or(1, |bands| bands.count.max(1));
+    let channels = clip.channels.count();
+    let mut channel_list = String::new();
+    for band in 0..bands {
+        let wavelengths = clip.bands.and_then(|bands| bands.wavelengths_nm);
+        let wavelength = wavelengths.and_then(|lengths| lengths.get(band));
+        let named = wavelength.map_or(String::new(), |nm| {
+            format!(" Name=\"{nm} nm\" EmissionWavelength=\"{nm}\" EmissionWavelengthUnit=\"nm\"")
+        });
+        let _ = write!(
+            channel_list,
+            "<Channel ID=\"Channel:0:{band}\"{named} SamplesPerPixel=\"{channels}\"/>"
+        );
+    }
     let schema = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
     format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\
@@ -130,13 +158,14 @@ fn ome(clip: &Clip<'_>) -> String {
          xsi:schemaLocation=\"{schema} {schema}/ome.xsd\">\
          <Image ID=\"Image:0\" Name=\"{name}\">\
          <Pixels ID=\"Pixels:0\" DimensionOrder=\"{order}\" Type=\"float\" BigEndian=\"false\" \
-         SizeX=\"{width}\" SizeY=\"{height}\" SizeZ=\"1\" SizeC=\"{channels}\" SizeT=\"{frames}\"{interval}>\
-         <Channel ID=\"Channel:0:0\" SamplesPerPixel=\"{channels}\"/>\
+         SizeX=\"{width}\" SizeY=\"{height}\" SizeZ=\"1\" SizeC=\"{size_c}\" SizeT=\"{size_t}\"{interval}>{channel_list}\
          <TiffData IFD=\"0\" PlaneCount=\"{frames}\"/>{planes}</Pixels></Image></OME>",
         name = escape_xml(clip.name),
-        channels = clip.channels.count(),
+        size_c = bands * channels,
+        size_t = frames / bands,
         // The channels of a page are interleaved, so they vary first.
-        order = if clip.channels == Channels::Grey { "XYZCT" } else { "XYCZT" },
+        order =
+            if clip.channels == Channels::Grey && clip.bands.is_none() { "XYZCT" } else { "XYCZT" },
     )
 }
 
@@ -167,7 +196,7 @@ mod tests {
     use tiff::decoder::{Decoder, DecodingResult};
     use tiff::tags::Tag;
 
-    use super::{Channels, Clip, escape_xml, head};
+    use super::{Bands, Channels, Clip, escape_xml, head};
 
     #[test]
     fn the_tiff_crate_reads_all_frames() {
@@ -185,6 +214,7 @@ mod tests {
             channels,
             interval_s: Some(0.25),
             times_s: Some(&times),
+            bands: None,
         };
         let mut file = head(&clip);
         let count = frames * height * width * channels.count();
@@ -204,6 +234,23 @@ mod tests {
             }
         }
         assert_eq!(decoded, values);
+    }
+
+    #[test]
+    fn bands_are_channels_with_their_wavelengths() {
+        let wavelengths_nm = Some(&[450.0, 460.5][..]);
+        let clip = Clip {
+            name: "a",
+            shape: (4, 5, 7),
+            channels: Channels::Grey,
+            interval_s: None,
+            times_s: None,
+            bands: Some(Bands { count: 2, wavelengths_nm }),
+        };
+        let text = String::from_utf8_lossy(&head(&clip)).into_owned();
+        assert!(text.contains("SizeC=\"2\" SizeT=\"2\"") && text.contains("\"XYCZT\""), "{text}");
+        assert!(text.contains("ID=\"Channel:0:1\" Name=\"460.5 nm\" EmissionWavelength=\"460.5\""));
+        assert!(text.contains("channels=2\nframes=2\n"));
     }
 
     #[test]

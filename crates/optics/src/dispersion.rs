@@ -156,6 +156,14 @@ impl Dispersion {
         self.resized(sensor, |length| length.saturating_sub(self.margin()))
     }
 
+    /// Rows and columns of the mask for bands of this size.
+    pub fn mask_size(&self, frame: (usize, usize)) -> (usize, usize) {
+        match self.mask {
+            MaskExtent::Scene => frame,
+            MaskExtent::Measurement => self.resized(frame, |length| length + self.margin()),
+        }
+    }
+
     /// The mask of a band on the sensor: the mask \[H,W\], displaced by the band's offset. Between pixels it is interpolated
     /// linearly, which keeps values on \[0,1\]. Where the mask ends it is 0.
     pub fn shear_mask(&self, mask: ArrayView2<'_, f32>, band: usize) -> Array2<f32> {
@@ -232,6 +240,9 @@ impl Dispersion {
             DispersionAxis::Row => source.0.start,
         };
         let shift = (first + whole).cast_signed() - along.start.cast_signed();
+        if source.0.is_empty() || source.1.is_empty() {
+            return Ok(Array2::zeros((rows.len(), columns.len())));
+        }
         let values = read(source.0, source.1)?;
         Ok(displaced(values.view(), self.array_axis(), (shift, fraction), along.len()))
     }
@@ -264,17 +275,15 @@ impl Dispersion {
     }
 
     /// True if a finding can be right about a spectral camera. It has one mask for all bands, so findings that compare
-    /// separate masks or look for motion do not apply. Neighbouring bands resemble one another, so a displacement of the
-    /// masks along the axis of dispersion looks like a change of wavelength.
+    /// separate masks or look for motion do not apply.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
-            DeadPixels, DriftedMasks, ExchangedMasks, FastMotion, MissingPattern, OneDimensional,
+            DeadPixels, ExchangedMasks, FastMotion, MissingPattern, OneDimensional,
             RepeatedPattern, StuckPixels, SwappedOrder, UnevenPatterns,
         };
         !matches!(
             code,
             DeadPixels
-                | DriftedMasks
                 | ExchangedMasks
                 | FastMotion
                 | MissingPattern
@@ -423,6 +432,11 @@ mod tests {
             let bands = dispersion(axis, &[0.0, 2.0, 4.3]);
             let frame = random((16, 18), 4);
             let (rows, columns) = (3..11, 0..9);
+            let empty = bands.sheared_window(2, frame.dim(), (0..1, 0..1), |r, c| {
+                assert!(!r.is_empty() && !c.is_empty());
+                Ok::<_, ()>(frame.slice(s![r, c]).to_owned())
+            });
+            assert_eq!(empty.unwrap(), Array2::<f32>::zeros((1, 1)));
             for band in 0..3 {
                 let sheared = bands.shear(frame.view(), band);
                 let window = bands.sheared_window(

@@ -6,8 +6,10 @@ use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::{SqlSafeStr, SqlitePool};
 
 /// Number, name and text of every migration, in order.
-const MIGRATIONS: &[(i64, &str, &str)] =
-    &[(1, "baseline", include_str!("../../../migrations/0001_baseline.sql"))];
+const MIGRATIONS: &[(i64, &str, &str)] = &[
+    (1, "baseline", include_str!("../../../migrations/0001_baseline.sql")),
+    (2, "dispersion", include_str!("../../../migrations/0002_dispersion.sql")),
+];
 
 /// Name of the first migration before version 0.1.0, whose databases this program does not read.
 pub const BEFORE_BASELINE: &str = "init";
