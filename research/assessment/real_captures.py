@@ -1,11 +1,12 @@
 """Compare the right masks of real spectral captures with wrong ones.
 
-    python real_captures.py SCI_RECON_BINARY --data FOLDER [--algorithm NAME] [--capture NAME...] [--keep FOLDER]
+    python real_captures.py SCI_RECON_BINARY --data FOLDER [--algorithm NAME] [--capture NAME...] [--rows N] [--keep FOLDER]
 
-FOLDER has the published files that CAPTURES lists. There is no truth, so the judge is the hold-out error: 1 % of the
+FOLDER has the published files that CAPTURES lists. There is no truth, so the judge is the hold-out error: 5 % of the
 sensor's pixels are declared bad, and the frames predict them through the masks. The error is relative to that of the mean
-of the eight pixels around each. Each row is printed as a JSON object; the last row of a capture is a summary. The status is
-1 if wrong masks predict better than the right ones, or if the program finds no fault with them.
+of the eight pixels around each; `worse_by` is the mean difference of the squared errors to those behind the right masks, in
+standard errors. Each row is printed as a JSON object; the last row of a capture is a summary. The status is 1 if wrong masks
+predict as well as the right ones, or if the program finds no error in them.
 """
 import argparse
 import json
@@ -23,7 +24,7 @@ CAPTURES = {
     'tsa_scene2': ('tsa_scene2.mat', 'meas_real', 'tsa_real_mask.mat', 'mask', 28, 2),
     'fern_root': ('SMEM_fern_root.mat', 'meas', 'SMEM_mask.mat', 'mask', 24, 2),
 }
-HELD_OUT = .01      # share of the pixels
+HELD_OUT = .05      # share of the pixels
 # Findings that follow from the test itself: pixels are held out, and the full scale of the captures is not published.
 EXPECTED = {'bad_pixels', 'level'}
 
@@ -92,6 +93,11 @@ def rows(a, name):
     other_file = next(entry[2] for entry in CAPTURES.values() if entry[2] != mask_file)
     other = array(a.data, other_file, 'mask')
     mask, other = (np.clip(one / one.max(), 0, 1) for one in (mask, other))
+    # Bands are displaced along the columns, so a strip of rows is a complete problem.
+    height = min(a.rows or len(y), len(y))
+    first = (len(y) - height) // 2
+    strip = slice(first, first + height)
+    y = y[strip]
     held_out = np.random.default_rng(1).random(y.shape) < HELD_OUT
     # Only columns that all bands reach: at the ends a few bands suffice.
     reached = np.zeros(y.shape, bool)
@@ -100,26 +106,31 @@ def rows(a, name):
     # A frame then has about half of its full scale in the brightest parts.
     full_scale = float(np.percentile(y, 99.9) / (.5 * mask.mean() * bands))
     neighbours = np.mean((y - around(y))[judged] ** 2)
+    right = None
     for variant, wrong in variants(mask, other).items():
+        wrong = wrong[strip]
         with tempfile.TemporaryDirectory() as folder:
             folder = pathlib.Path(folder)
             report, frames = reconstruct(a, folder, wrong, y, held_out, step, bands, full_scale)
             if a.keep and variant == 'right':
                 a.keep.mkdir(parents=True, exist_ok=True)
                 np.save(a.keep / f'{name}.npy', frames)
-        error = np.mean((y - predicted(frames, wrong, step))[judged] ** 2)
+        squares = (y - predicted(frames, wrong, step))[judged] ** 2
+        right = squares if right is None else right
+        excess = squares - right
+        worse_by = excess.mean() / max(excess.std() / np.sqrt(len(excess)), 1e-30)
         assessment = report['assessment'] or {}
         findings = {one['code']: one['severity'] for one in report['findings'] if one['code'] not in EXPECTED}
-        yield {'capture': name, 'masks': variant, 'hold_out_error': round(float(np.sqrt(error / neighbours)), 4),
-               'findings': findings, 'psnr_db': assessment.get('psnr_db'), 'cpu_seconds': round(report['cpu_seconds'], 1)}
+        yield {'capture': name, 'masks': variant, 'hold_out_error': round(float(np.sqrt(squares.mean() / neighbours)), 4),
+               'worse_by': round(float(worse_by), 1), 'findings': findings, 'psnr_db': assessment.get('psnr_db'), 'cpu_seconds': round(report['cpu_seconds'], 1)}
 
 
 def summary(name, found):
     right, wrong = found[0], found[1:]
-    best = min(wrong, key=lambda row: row['hold_out_error'])
+    best = min(wrong, key=lambda row: row['worse_by'])
     unnoticed = [row['masks'] for row in wrong if 'error' not in row['findings'].values()]
     return {'capture': name, 'right': right['hold_out_error'], 'best_wrong': best['hold_out_error'],
-            'best_wrong_masks': best['masks'], 'preferred': right['hold_out_error'] < best['hold_out_error'],
+            'best_wrong_masks': best['masks'], 'worse_by': best['worse_by'], 'preferred': best['worse_by'] > 3,
             'false_alarms': sorted(right['findings']), 'unnoticed': unnoticed}
 
 
@@ -129,6 +140,7 @@ def main():
     parser.add_argument('--data', type=pathlib.Path, required=True, help='folder with the published files')
     parser.add_argument('--algorithm', default='gap-tv')
     parser.add_argument('--capture', nargs='*', choices=CAPTURES, default=list(CAPTURES))
+    parser.add_argument('--rows', type=int, help='height of the strip in the middle that is used [default: all rows]')
     parser.add_argument('--keep', type=pathlib.Path, help='folder for the bands behind the right masks, as npy')
     a = parser.parse_args()
     failed = False

@@ -559,7 +559,7 @@ impl Report {
         quality: Option<Quality>,
     ) -> Self {
         let frames = input.masks.dim().0;
-        let SceneShape { height, width, .. } = recipe.shape.of_frames(recipe.dispersion.as_ref());
+        let SceneShape { height, width, .. } = recipe.shape.frame_shape(recipe.dispersion.as_ref());
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
         let summary = Summary::of(&tiles);

@@ -50,8 +50,8 @@ impl Lab {
                     "iid",
                     "--out",
                     "sim",
-                ],
-                &*options(axis, offsets, mask),
+                ][..],
+                &options(axis, offsets, mask)[..],
             ]
             .concat(),
         );
@@ -192,8 +192,8 @@ async fn fractions_rows_and_masks_of_the_measurement_are_reconstructed() {
                 "--json",
                 "--out",
                 "out",
-            ],
-            &*options(axis, offsets, mask),
+            ][..],
+            &options(axis, offsets, mask)[..],
         ]
         .concat();
         let output = lab.command(&line);
@@ -266,17 +266,19 @@ async fn a_dispersion_that_does_not_fit_is_refused_with_the_expected_size() {
     let output = lab.command(&line);
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(!output.status.success() && text.contains("96x110: 8 bands of 96x96"), "{text}");
-    let output = lab.command(&[
-        "simulate",
-        "--frames",
-        "cube.npy",
-        "--compression-ratio",
-        "4",
-        "--dispersion-offsets",
-        "0:2:8",
-        "--out",
-        "other",
-    ]);
+    let output = lab.command(
+        &[
+            "simulate",
+            "--frames",
+            "cube.npy",
+            "--compression-ratio",
+            "4",
+            "--dispersion-offsets",
+            "0:2:8",
+            "--out",
+            "other",
+        ][..],
+    );
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(!output.status.success() && text.contains("one offset for each band"), "{text}");
 }
@@ -294,8 +296,8 @@ async fn submit_sends_the_dispersion() {
             "--algorithm",
             "gap-tv",
             "--json",
-        ],
-        &*options("column", "0:2:8", "scene"),
+        ][..],
+        &options("column", "0:2:8", "scene")[..],
     ]
     .concat();
     let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));

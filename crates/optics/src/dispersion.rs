@@ -165,7 +165,7 @@ impl Dispersion {
     }
 
     /// The mask of a band on the sensor: the mask \[H,W\], displaced by the band's offset. Between pixels it is interpolated
-    /// linearly, which keeps values on \[0,1\]. Where the mask ends it is 0.
+    /// linearly, which keeps values on \[0,1\]. Beyond the mask it is 0.
     pub fn shear_mask(&self, mask: ArrayView2<'_, f32>, band: usize) -> Array2<f32> {
         let length = self.sensor_size(mask.dim()).map_or(0, |size| self.along(size));
         let (whole, fraction) = self.offset(band);

@@ -406,7 +406,7 @@ class Calibration(Entity):
     def masks(self) -> npt.NDArray[np.float32]:
         """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file.
 
-        Of a spectral camera, they are the masks of the bands on the sensor.
+        A spectral camera has one mask for each band, as it lies on the sensor.
         """
         record, name = self.record, self.record["masks"]
         with TemporaryDirectory(prefix="sci-recon-") as folder:

@@ -283,7 +283,7 @@ impl SnapshotSelection {
 impl JobSpec {
     /// The size of the frames: that of the measurement, or of a band of a spectral camera.
     pub fn frame_shape(&self) -> SceneShape {
-        self.shape.of_frames(self.dispersion.as_ref())
+        self.shape.frame_shape(self.dispersion.as_ref())
     }
 
     /// The job for a spectral camera, if there is a dispersion.

@@ -192,8 +192,8 @@ pub struct SceneShape {
 }
 
 impl SceneShape {
-    /// The same with the rows and columns of the frames, which are smaller than the measurement with a dispersion.
-    pub fn of_frames(self, dispersion: Option<&Dispersion>) -> Self {
+    /// The shape of the frames: the bands of a spectral camera are smaller than the measurement.
+    pub fn frame_shape(self, dispersion: Option<&Dispersion>) -> Self {
         let sensor = (self.height, self.width);
         let (height, width) = dispersion.map_or(sensor, |bands| bands.frame_size(sensor));
         Self { height, width, ..self }

@@ -145,7 +145,7 @@ impl Recipe {
         run: RunRecord,
     ) -> Manifest {
         let SceneShape { frames, height, width, .. } =
-            self.shape.of_frames(self.dispersion.as_ref());
+            self.shape.frame_shape(self.dispersion.as_ref());
         // All bands are exposed at the same time.
         let camera = match self.dispersion {
             Some(_) => None,
