@@ -29,6 +29,13 @@ HELD_OUT = .05      # share of the pixels
 EXPECTED = {'bad_pixels', 'level'}
 
 
+def dark(y, side=16):
+    """The level without light, which is not published: a low quantile of the means of blocks."""
+    height, width = (length // side * side for length in y.shape)
+    blocks = y[:height, :width].reshape(height // side, side, width // side, side)
+    return np.percentile(blocks.mean((1, 3)), 1)
+
+
 def array(folder, file, name):
     return scipy.io.loadmat(folder / file)[name].astype(np.float32)
 
@@ -90,6 +97,7 @@ def reconstruct(a, folder, mask, y, held_out, step, bands, full_scale):
 def rows(a, name):
     file, key, mask_file, mask_key, bands, step = CAPTURES[name]
     y, mask = array(a.data, file, key), array(a.data, mask_file, mask_key)
+    y = y - dark(y)
     other_file = next(entry[2] for entry in CAPTURES.values() if entry[2] != mask_file)
     other = array(a.data, other_file, 'mask')
     mask, other = (np.clip(one / one.max(), 0, 1) for one in (mask, other))

@@ -403,9 +403,10 @@ fn overlay_tiles(
 mod tests {
     use std::sync::Arc;
 
-    use super::{Files, FinishedTile, Mosaic, Stack, Unfinished};
+    use super::{Dispersed, Dispersion, Files, FinishedTile, Mosaic, Stack, Unfinished};
+    use engine::job::{DispersionAxis, MaskExtent};
     use formats::{npy, planar};
-    use ndarray::{Array3, s};
+    use ndarray::{Array3, Axis, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
         let (frames, height, width) = stack.dim();
@@ -419,6 +420,49 @@ mod tests {
 
     fn stack(shape: (usize, usize, usize), files: Files) -> Stack {
         Stack { shape, identity: "x".into(), files, mosaic: None, dispersion: None, white: None }
+    }
+
+    #[test]
+    fn bands_are_shown_in_their_place_before_and_after_their_assembly() {
+        let folder = tempfile::tempdir().unwrap();
+        let bands = Dispersion {
+            axis: DispersionAxis::Column,
+            offsets: vec![0.0, 2.0, 3.5],
+            wavelengths: None,
+            mask: MaskExtent::Scene,
+        };
+        let cube =
+            Array3::from_shape_fn((3, 10, 12), |(k, i, j)| (k * 7 + i * 3 + j) as f32 / 40.0);
+        let mut sensor = Array3::zeros((3, 10, 16));
+        for (k, frame) in cube.outer_iter().enumerate() {
+            sensor.index_axis_mut(Axis(0), k).assign(&bands.shear(frame, k));
+        }
+        let dispersed = |files| {
+            let dispersed = Dispersed { bands: bands.clone(), sensor: (10, 16) };
+            Stack { dispersion: Some(Arc::new(dispersed)), ..stack((3, 10, 12), files) }
+        };
+        let preview = Some(prepared(folder.path(), "preview", &sensor));
+        let before = dispersed(Files::Tiles(Arc::new(Unfinished { preview, tiles: Vec::new() })));
+        let path = folder.path().join("frames.npy");
+        npy::write_f32(&path, cube.view()).unwrap();
+        let after = dispersed(Files::Frames(path));
+        for (k, frame) in cube.outer_iter().enumerate() {
+            let shown = |stack: &Stack| {
+                let picture = stack.frame(k);
+                picture.reduce(&picture.whole(0)).unwrap()
+            };
+            assert_eq!(shown(&after), frame);
+            assert_eq!(shown(&before), bands.unshear(sensor.index_axis(Axis(0), k), k));
+        }
+        // The residual lies on the sensor.
+        let y = sensor.sum_axis(Axis(0)).insert_axis(Axis(0));
+        let measurement = stack((1, 10, 16), Files::Prepared(prepared(folder.path(), "y", &y)));
+        let open = Array3::ones((3, 10, 16));
+        let masks = stack((3, 10, 16), Files::Prepared(prepared(folder.path(), "masks", &open)));
+        let picture = after.residual(&masks, &measurement, 0);
+        let residual = picture.reduce(&picture.whole(0)).unwrap();
+        assert_eq!(residual.dim(), (10, 16));
+        assert!(residual.iter().all(|value| *value < 1e-5), "{residual}");
     }
 
     #[test]
