@@ -275,11 +275,12 @@ impl Dispersion {
     }
 
     /// True if a finding can be right about a spectral camera. It has one mask for all bands, so findings that compare
-    /// separate masks or look for motion do not apply.
+    /// separate masks or look for motion do not apply. The colour of a scene varies from place to place, which looks like an
+    /// offset that the masks do not explain.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
-            DeadPixels, ExchangedMasks, FastMotion, MissingPattern, OneDimensional,
-            RepeatedPattern, StuckPixels, SwappedOrder, UnevenPatterns,
+            DeadPixels, ExchangedMasks, FastMotion, MissingPattern, NegativeOffset, NoDark,
+            OneDimensional, RepeatedPattern, StuckPixels, SwappedOrder, UnevenPatterns, WrongDark,
         };
         !matches!(
             code,
@@ -287,11 +288,14 @@ impl Dispersion {
                 | ExchangedMasks
                 | FastMotion
                 | MissingPattern
+                | NegativeOffset
+                | NoDark
                 | OneDimensional
                 | RepeatedPattern
                 | StuckPixels
                 | SwappedOrder
                 | UnevenPatterns
+                | WrongDark
         )
     }
 
