@@ -110,10 +110,11 @@ impl<'a> Source<'a> {
             opened.full_scale = FullScale::ONE;
             opened.reading.scale_basis = ScaleBasis::Values;
         }
-        match &self.dispersion {
-            Some(dispersion) => sheared(opened, dispersion, &self.limits),
-            None => Ok(opened),
+        if let Some(dispersion) = &self.dispersion {
+            opened.reader = sheared(opened.reader, dispersion, &self.limits, &self.name)?;
+            opened.info = *opened.reader.info();
         }
+        Ok(opened)
     }
 
     fn open_array(&self) -> Result<Box<dyn FrameReader + Send>> {

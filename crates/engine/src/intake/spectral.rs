@@ -3,7 +3,6 @@
 use ndarray::Array2;
 
 use super::IntakeError;
-use super::open::Opened;
 use crate::intake::error::Result;
 use crate::job::{Dispersion, MaskExtent};
 use formats::{FormatError, FrameReader, Limits, StackInfo};
@@ -34,19 +33,25 @@ impl FrameReader for Sheared {
     }
 }
 
-/// Makes the masks of all bands from the only mask of an open file.
+/// The masks of all bands, made from the only mask of an open file. `name` is the name of the file in errors.
 ///
 /// Errors: [`IntakeError::Content`] for several masks, and for a mask that is too small; [`IntakeError::Format`] for masks
 /// above the limits.
-pub(super) fn sheared(opened: Opened, dispersion: &Dispersion, limits: &Limits) -> Result<Opened> {
-    let StackInfo { frames, height, width, .. } = opened.info;
+pub(super) fn sheared(
+    reader: Box<dyn FrameReader + Send>,
+    dispersion: &Dispersion,
+    limits: &Limits,
+    name: &str,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let info = *reader.info();
+    let StackInfo { frames, height, width, .. } = info;
     if frames != 1 {
         let problem = format!(
             "the file has {frames} masks of {height}x{width} (rows x columns), but a dispersion makes the masks of all \
              bands from one two-dimensional mask: select it with `frames`, or leave the dispersion out if the file has a \
              mask for each band"
         );
-        return Err(IntakeError::content(opened.name, &problem));
+        return Err(IntakeError::content(name, &problem));
     }
     let Some((rows, columns)) = dispersion.sensor_size((height, width)) else {
         let problem = format!(
@@ -55,16 +60,14 @@ pub(super) fn sheared(opened: Opened, dispersion: &Dispersion, limits: &Limits) 
             dispersion.margin(),
             dispersion.axis
         );
-        return Err(IntakeError::content(opened.name, &problem));
+        return Err(IntakeError::content(name, &problem));
     };
     let bands = dispersion.bands();
-    let checked = limits.check_shape(opened.info.format, bands as u64, rows as u64, columns as u64);
-    checked.map_err(IntakeError::format(&opened.name))?;
-    let info = StackInfo { frames: bands, height: rows, width: columns, ..opened.info };
-    let reader = opened.reader;
+    let checked = limits.check_shape(info.format, bands as u64, rows as u64, columns as u64);
+    checked.map_err(IntakeError::format(name))?;
+    let info = StackInfo { frames: bands, height: rows, width: columns, ..info };
     let dispersion = dispersion.clone();
-    let reader = Box::new(Sheared { reader, info, dispersion, mask: None, band: 0 });
-    Ok(Opened { info, reader, ..opened })
+    Ok(Box::new(Sheared { reader, info, dispersion, mask: None, band: 0 }))
 }
 
 /// Explains the size of a measurement behind masks of `sensor` pixels that were made with a dispersion.
