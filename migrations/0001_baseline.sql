@@ -162,6 +162,8 @@ CREATE TABLE calibrations (
     clipped_negatives INTEGER NOT NULL,
     -- The colours of a cell of 2x2 pixels, row by row; NULL for a grey sensor.
     mosaic            TEXT CHECK (mosaic IN ('rggb', 'bggr', 'grbg', 'gbrg')),
+    -- Displacement of the bands of a spectral camera, as JSON; NULL for masks that were uploaded one by one.
+    dispersion        TEXT,
     reading           TEXT, -- how the masks' file was read, as JSON; NULL for captures
     created_at        INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;

@@ -13,7 +13,8 @@ use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{
-    NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic, packing, sequence,
+    DispersionArguments, NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic,
+    packing, sequence,
 };
 use super::fields::Role;
 use super::model::{Model, cut};
@@ -22,11 +23,11 @@ use super::progress::SnapshotBar;
 use super::verdict;
 use crate::cli::error::Result;
 use engine::intake::{
-    self, Behind, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth,
+    self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Finding, MaskOrder, Mosaic, SceneShape, Schedule, Sequence, Sha256,
-    keeps_mosaic,
+    Algorithm, Assessment, Dispersion, Finding, MaskOrder, Mosaic, SceneShape, Schedule, Sequence,
+    Sha256, keeps_mosaic,
 };
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
@@ -96,6 +97,8 @@ pub struct Arguments {
     /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
     #[arg(long, value_name = "NAME")]
     array: Option<String>,
+    #[command(flatten)]
+    dispersion: DispersionArguments,
     /// The order of the axes in the masks' file [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     masks_axes: Option<Axes>,
@@ -179,7 +182,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         (algorithm, &schedule),
         (arguments.tile, arguments.overlap),
         model.as_ref(),
-        (arguments.sequence, snapshots.len() as u32),
+        (input.sequence(arguments.sequence), snapshots.len() as u32),
         dim,
     )?;
     let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots.clone())?);
@@ -222,16 +225,21 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let frames = sequence.masks.dim().0;
     let solved_frame =
         |index| solved.frame(&sequence, input.first + index / frames, index % frames);
+    let dispersion = input.sources.masks.dispersion.as_ref();
+    let frame = |index| match dispersion {
+        Some(bands) => bands.unshear(solved_frame(index).view(), index % frames),
+        None => solved_frame(index),
+    };
     let compare = |(truth, channels): &(Array3<f32>, Channels)| {
         let frame = |index| match (arguments.mosaic, channels) {
             (Some(mosaic), Channels::Rgb) => mosaic.demosaick(solved_frame(index).view(), (0, 0)),
-            _ => solved_frame(index),
+            _ => frame(index),
         };
         Quality::compare(frame, truth.view(), *channels)
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
     let mut histogram = Histogram::default();
-    (0..frames * snapshots.len()).for_each(|index| histogram.add(&solved_frame(index)));
+    (0..frames * snapshots.len()).for_each(|index| histogram.add(&frame(index)));
     let white_level = white_level(&histogram, white);
     let recipe = input.recipe(&setup, (white, white_level), &solved)?;
     let expected = |snapshot| {
@@ -288,6 +296,12 @@ impl<'a> Sources<'a> {
         let scene = arguments.scene.as_deref();
         let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
         let missing = || CliError::Input("give --masks and --measurement, or --scene".into());
+        let dispersion = arguments.dispersion.resolve()?;
+        if dispersion.is_some() && arguments.mosaic.is_some() {
+            let text =
+                "a spectral camera has a grey sensor: leave out --mosaic or --dispersion-offsets";
+            return Err(CliError::Input(text.into()));
+        }
         Ok(Self {
             masks: Source::file(
                 named(&arguments.masks).ok_or_else(missing)?,
@@ -299,7 +313,8 @@ impl<'a> Sources<'a> {
             .part(
                 Part { crop: arguments.masks_crop, frames: arguments.masks_frames },
                 arguments.masks_packing,
-            ),
+            )
+            .dispersed(dispersion),
             measurement: Source::file(
                 named(&arguments.measurement).ok_or_else(missing)?,
                 SceneArray::Measurements,
@@ -340,8 +355,11 @@ impl<'a> Input<'a> {
             .map_err(|error| CliError::from(error).about(Role::Masks))?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
+        let dispersion = sources.masks.dispersion.clone();
+        let sensor = (height, width);
+        let frame_size = dispersion.as_ref().map_or(sensor, |bands| bands.frame_size(sensor));
         if let Some(truth) = &mut sources.truth {
-            truth.size = Some((height, width));
+            truth.size = Some(frame_size);
         }
         let Snapshots { first, last } = arguments.snapshots;
         let Arguments { dark, saturation, .. } = arguments;
@@ -353,6 +371,15 @@ impl<'a> Input<'a> {
             .map_err(|error| CliError::from(error).about(Role::Measurement))?;
         let (measurement, snapshots) = (read.measurement, read.count);
         let (count, rows, columns) = measurement.array.dim();
+        if let Some(dispersion) = &dispersion
+            && (rows, columns) != (height, width)
+        {
+            return Err(CliError::Input(format!(
+                "measurement {} is {rows}x{columns} (rows x columns): {}",
+                sources.measurement.path.display(),
+                expected_size(dispersion, (height, width))
+            )));
+        }
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
                 "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
@@ -374,7 +401,7 @@ impl<'a> Input<'a> {
                  both: crop them so that they begin with the first pixel of a cell"
             )));
         }
-        let dim = masks.array.dim();
+        let dim = (frames, frame_size.0, frame_size.1);
         let truth = match &sources.truth {
             Some(source) => {
                 read_truth(source, dim, mosaic.is_some(), first..first + count, snapshots)?
@@ -383,7 +410,7 @@ impl<'a> Input<'a> {
         };
         let has_dark = !dark.is_empty();
         let arrays = (masks.array.view(), measurement.array.view());
-        let (calibration, judged) = judge(arrays, mosaic, has_dark)?;
+        let (calibration, judged) = judge(arrays, (mosaic, dispersion.as_ref()), has_dark)?;
         let judged = judged.into_iter().map(|finding| {
             // Findings count from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
@@ -398,6 +425,11 @@ impl<'a> Input<'a> {
         let (frames, height, width) = self.masks.array.dim();
         let snapshots = self.measurement.array.dim().0 as u32;
         SceneShape { frames, height, width, snapshots, mosaic: self.mosaic }
+    }
+
+    /// Snapshots of a spectral camera are reconstructed one by one: their bands do not continue one another.
+    fn sequence(&self, stated: Sequence) -> Sequence {
+        if self.sources.masks.dispersion.is_some() { Sequence::Separate } else { stated }
     }
 
     /// Indices of the snapshots in the file.
@@ -425,6 +457,7 @@ impl<'a> Input<'a> {
             schedule: full_schedule(&setup.schedule, pilot.as_ref()),
             pilot,
             shape: self.shape(),
+            dispersion: self.sources.masks.dispersion.clone(),
             inputs: Inputs {
                 masks_sha256: sha256(self.sources.masks.path)?,
                 masks_axes: self.masks.axes.map(|axes| axes.to_string()),
@@ -450,14 +483,16 @@ impl<'a> Input<'a> {
 /// findings on the snapshots. The checks read prepared files, so the arrays are written to temporary ones.
 fn judge(
     (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
-    mosaic: Option<Mosaic>,
+    (mosaic, dispersion): (Option<Mosaic>, Option<&Dispersion>),
     has_dark: bool,
 ) -> Result<(Option<Finding>, Vec<Finding>)> {
     let limits = Limits::default();
     let prepared = [prepare(masks)?, prepare(snapshots)?];
     let paths = (prepared[0].path(), prepared[1].path());
-    let report = intake::report(&planar::Reader::open(paths.0, &limits)?, &mut |_| true)?;
-    Ok((report.report.warning(), intake::judge(paths, mosaic, has_dark, &limits)?))
+    let masks = planar::Reader::open(paths.0, &limits)?;
+    let report = intake::report(&masks, dispersion.is_some(), &mut |_| true)?;
+    let judged = intake::judge(paths, (mosaic, dispersion), has_dark, &limits)?;
+    Ok((report.report.warning(), judged))
 }
 
 fn prepare(frames: ArrayView3<'_, f32>) -> Result<tempfile::NamedTempFile> {
@@ -531,7 +566,8 @@ impl Report {
         run: &RunRecord,
         quality: Option<Quality>,
     ) -> Self {
-        let (frames, height, width) = input.masks.dim();
+        let frames = input.masks.dim().0;
+        let SceneShape { height, width, .. } = recipe.shape.frame_shape(recipe.dispersion.as_ref());
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
         let summary = Summary::of(&tiles);

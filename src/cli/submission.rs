@@ -6,10 +6,12 @@ use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::CliError;
-use super::arguments::{Snapshots, axes, frame_range, mosaic, named_all, packing, sequence};
+use super::arguments::{
+    DispersionArguments, Snapshots, axes, frame_range, mosaic, named_all, packing, sequence,
+};
 use super::client::{Client, Result};
 use super::fields::Role;
-use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
+use engine::job::{Algorithm, CalibrationId, Dispersion, Mosaic, Sequence, Sha256};
 use formats::{Axes, Crop, Packing};
 
 /// Options of the calibration, the measurement and the job.
@@ -49,6 +51,8 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
           help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
+    #[command(flatten, next_help_heading = CALIBRATION)]
+    dispersion: DispersionArguments,
     /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     bad_pixels: Option<PathBuf>,
@@ -136,15 +140,21 @@ impl SubmissionArguments {
     /// Uploads masks and dark captures, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
+        let dispersion = self.dispersion.resolve()?;
         let calibration = match (&self.calibration, &self.masks) {
+            (Some(_), _) if dispersion.is_some() => {
+                let text =
+                    "--dispersion-offsets belongs to --masks: a calibration has its own dispersion";
+                return Err(CliError::Input(text.into()).into());
+            }
             (Some(id), _) => id.to_string(),
             (None, Some(masks)) => {
                 let bad_pixels = match &self.bad_pixels {
                     Some(map) => Some(client.upload_with_bar(map).await?),
                     None => None,
                 };
-                let body =
-                    self.calibration_request(client.upload_with_bar(masks).await?, bad_pixels);
+                let sent = client.upload_with_bar(masks).await?;
+                let body = self.calibration_request(sent, bad_pixels, dispersion);
                 // One file of masks creates one calibration for all clients.
                 let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
                 let created = client.create_checked("/v1/calibrations", &body, &key).await;
@@ -169,7 +179,12 @@ impl SubmissionArguments {
         Ok(sent)
     }
 
-    fn calibration_request(&self, masks: Sha256, bad_pixels: Option<Sha256>) -> Value {
+    fn calibration_request(
+        &self,
+        masks: Sha256,
+        bad_pixels: Option<Sha256>,
+        dispersion: Option<Dispersion>,
+    ) -> Value {
         let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
         add(&mut body, "array", json!(self.masks_array));
         add(&mut body, "axes", json!(self.masks_axes));
@@ -178,6 +193,7 @@ impl SubmissionArguments {
         add(&mut body, "packing", json!(self.masks_packing));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         add(&mut body, "mosaic", json!(self.mosaic));
+        add(&mut body, "dispersion", json!(dispersion));
         add(&mut body, "bad_pixels", json!(bad_pixels));
         add(&mut body, "name", json!(self.masks_name));
         Value::Object(body)
@@ -302,6 +318,10 @@ mod tests {
             ("masks-full-scale", "255"),
             ("masks-name", "May"),
             ("mosaic", "rggb"),
+            ("dispersion-offsets", "0:2:8"),
+            ("dispersion-axis", "row"),
+            ("dispersion-wavelengths", "450:10:8"),
+            ("dispersion-mask", "measurement"),
             ("bad-pixels", "b.npy"),
             ("array", "meas"),
             ("axes", "row-column-frame"),
@@ -337,7 +357,8 @@ mod tests {
         let arguments = SubmissionArguments::from_arg_matches(&matches).unwrap();
 
         let sha256 = Sha256::of(b"file");
-        let calibration = arguments.calibration_request(sha256, Some(sha256));
+        let dispersion = arguments.dispersion.resolve().unwrap();
+        let calibration = arguments.calibration_request(sha256, Some(sha256), dispersion);
         // Captures of many files are for `calibrate`, the dashboard and the client libraries.
         let expected = properties("CalibrationRequest", &["captures"]);
         assert_eq!(names(calibration.as_object().unwrap()), expected);

@@ -17,9 +17,9 @@ use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
 use engine::job::{
-    Algorithm, Assessment, CalibrationId, Finding, FindingCode, InvalidField, JobId, JobRequest,
-    JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule,
-    Sequence, SnapshotRange, TileSpec, Timestamp, Webhook, priority_error,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
+    JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape,
+    Schedule, Sequence, SnapshotRange, TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
@@ -36,7 +36,10 @@ pub(super) struct JobBody {
     label: Option<Label>,
     calibration: CalibrationId,
     measurement: MeasurementId,
+    /// The size of the frames.
     shape: SceneShape,
+    /// Displacement of the bands of a spectral camera, whose bands are the frames; null for a video.
+    dispersion: Option<Dispersion>,
     snapshots: SnapshotRange,
     sequence: Sequence,
     run: RunSpec,
@@ -158,6 +161,7 @@ impl JobBody {
         };
         let webhook = WebhookBody::new(app, &job).await?;
         let spec = job.spec;
+        let shape = spec.frame_shape();
         Ok(Self {
             id: job.id,
             lab: job.lab,
@@ -165,7 +169,8 @@ impl JobBody {
             label: spec.label,
             calibration: spec.calibration,
             measurement: spec.measurement,
-            shape: spec.shape,
+            shape,
+            dispersion: spec.dispersion,
             snapshots: spec.snapshots,
             sequence: spec.sequence,
             run: spec.run,
@@ -331,6 +336,7 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     };
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
+    let resolved = resolved.and_then(|spec| spec.with_dispersion(calibration.facts.dispersion));
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     // If the report is not finished yet, the task that writes it adds the warning. A bad calibration causes other findings,
     // so it comes first.

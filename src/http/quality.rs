@@ -47,7 +47,7 @@ pub(super) async fn show(
     app.store.upload(&access.lab, query.truth).await?;
     result_file(&app, &job, Some(snapshot), "frames.npy").await?;
     let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
-    let (shape, truth) = (job.spec.shape, query.truth);
+    let (shape, truth) = (job.spec.frame_shape(), query.truth);
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
     let limits = app.limits;
     let frames = intake::run(&app, &access.lab, move || {

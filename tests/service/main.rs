@@ -45,6 +45,7 @@ mod recipes;
 mod resumable;
 mod samples;
 mod sequences;
+mod spectral;
 mod storm;
 mod upgrade;
 mod uploads;

@@ -21,6 +21,17 @@ pub struct Clip<'a> {
     pub interval_s: Option<f64>,
     /// Start of each frame in seconds, if known.
     pub times_s: Option<&'a [f64]>,
+    /// The bands of a spectral image, for frames that are its bands. The frames of several images follow one another.
+    pub bands: Option<Bands<'a>>,
+}
+
+/// The bands of a spectral image.
+#[derive(Debug, Clone, Copy)]
+pub struct Bands<'a> {
+    /// Number of bands.
+    pub count: usize,
+    /// Wavelength of each band in nanometres, if known.
+    pub wavelengths_nm: Option<&'a [f64]>,
 }
 
 const ASCII: u16 = 2;
@@ -155,6 +166,20 @@ fn ome(clip: &Clip<'_>) -> String {
             "<Plane TheZ=\"0\" TheT=\"{frame}\" TheC=\"0\" DeltaT=\"{time}\" DeltaTUnit=\"s\"/>"
         );
     }
+    let bands = clip.bands.map_or(1, |bands| bands.count.max(1));
+    let channels = clip.channels.count();
+    let mut channel_list = String::new();
+    for band in 0..bands {
+        let wavelengths = clip.bands.and_then(|bands| bands.wavelengths_nm);
+        let wavelength = wavelengths.and_then(|lengths| lengths.get(band));
+        let named = wavelength.map_or(String::new(), |nm| {
+            format!(" Name=\"{nm} nm\" EmissionWavelength=\"{nm}\" EmissionWavelengthUnit=\"nm\"")
+        });
+        let _ = write!(
+            channel_list,
+            "<Channel ID=\"Channel:0:{band}\"{named} SamplesPerPixel=\"{channels}\"/>"
+        );
+    }
     let schema = "http://www.openmicroscopy.org/Schemas/OME/2016-06";
     format!(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\
@@ -162,13 +187,14 @@ fn ome(clip: &Clip<'_>) -> String {
          xsi:schemaLocation=\"{schema} {schema}/ome.xsd\">\
          <Image ID=\"Image:0\" Name=\"{name}\">\
          <Pixels ID=\"Pixels:0\" DimensionOrder=\"{order}\" Type=\"float\" BigEndian=\"false\" \
-         SizeX=\"{width}\" SizeY=\"{height}\" SizeZ=\"1\" SizeC=\"{channels}\" SizeT=\"{frames}\"{interval}>\
-         <Channel ID=\"Channel:0:0\" SamplesPerPixel=\"{channels}\"/>\
+         SizeX=\"{width}\" SizeY=\"{height}\" SizeZ=\"1\" SizeC=\"{size_c}\" SizeT=\"{size_t}\"{interval}>{channel_list}\
          <TiffData IFD=\"0\" PlaneCount=\"{frames}\"/>{planes}</Pixels></Image></OME>",
         name = escape_xml(clip.name),
-        channels = clip.channels.count(),
+        size_c = bands * channels,
+        size_t = frames / bands,
         // The channels of a page are interleaved, so they vary first.
-        order = if clip.channels == Channels::Grey { "XYZCT" } else { "XYCZT" },
+        order =
+            if clip.channels == Channels::Grey && clip.bands.is_none() { "XYZCT" } else { "XYCZT" },
     )
 }
 
@@ -199,7 +225,7 @@ mod tests {
     use tiff::decoder::{Decoder, DecodingResult};
     use tiff::tags::Tag;
 
-    use super::{Channels, Clip, Kind, escape_xml, head, head_of};
+    use super::{Bands, Channels, Clip, Kind, escape_xml, head, head_of};
 
     #[test]
     fn the_tiff_crate_reads_all_frames() {
@@ -218,6 +244,7 @@ mod tests {
             channels: Channels::Grey,
             interval_s: None,
             times_s: None,
+            bands: None,
         };
         assert_eq!(head(&clip(1023))[2], 0x2a);
         assert_eq!(head(&clip(1024))[2], 0x2b);
@@ -232,6 +259,7 @@ mod tests {
             channels,
             interval_s: Some(0.25),
             times_s: Some(&times),
+            bands: None,
         };
         let count = frames * height * width * channels.count();
         let mut file = head_of(kind, &clip, 4 * count / frames);
@@ -251,6 +279,23 @@ mod tests {
             }
         }
         assert_eq!(decoded, values);
+    }
+
+    #[test]
+    fn bands_are_channels_with_their_wavelengths() {
+        let wavelengths_nm = Some(&[450.0, 460.5][..]);
+        let clip = Clip {
+            name: "a",
+            shape: (4, 5, 7),
+            channels: Channels::Grey,
+            interval_s: None,
+            times_s: None,
+            bands: Some(Bands { count: 2, wavelengths_nm }),
+        };
+        let text = String::from_utf8_lossy(&head(&clip)).into_owned();
+        assert!(text.contains("SizeC=\"2\" SizeT=\"2\"") && text.contains("\"XYCZT\""), "{text}");
+        assert!(text.contains("ID=\"Channel:0:1\" Name=\"460.5 nm\" EmissionWavelength=\"460.5\""));
+        assert!(text.contains("channels=2\nframes=2\n"));
     }
 
     #[test]

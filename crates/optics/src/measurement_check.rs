@@ -686,7 +686,10 @@ fn drifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
     let asymmetry = rows.asymmetry.hypot(columns.asymmetry);
     let significant = asymmetry > MIN_DRIFT || rows.excess.max(columns.excess) > MIN_DRIFT_EXCESS;
     significant.then(|| {
-        let along_rows = rows.excess > columns.excess;
+        let sign = |drift: Drift| {
+            (drift.asymmetry / MIN_DRIFT).max(drift.excess / MIN_DRIFT_EXCESS)
+        };
+        let along_rows = sign(rows) > sign(columns);
         let (axis, drift) = if along_rows { ("row", rows) } else { ("column", columns) };
         let [before, after] = drift.explained.map(|share| 100.0 * share);
         let detail = format!(

@@ -82,6 +82,7 @@ impl Lab {
             clipped_negatives: 0,
             mosaic: None,
             reading: None,
+            dispersion: None,
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();

@@ -68,7 +68,7 @@ impl Local {
                 }),
                 None => {
                     let masks = task.masks.ok_or_else(|| missing_input(kind))?;
-                    Ok(TaskInput::Report(self.path(masks)))
+                    Ok(TaskInput::Report { masks: self.path(masks), spectral: task.spectral })
                 }
             },
             Work::Movie(work) => {
@@ -295,10 +295,12 @@ fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
     let facts = &measurement.facts;
     let frames = spec.shape.frames;
     let record = CameraRecord::new((facts.camera_fps, facts.exposure_s), 0, frames);
+    // The bands of a spectral camera are exposed at the same time.
+    let record = record.filter(|_| spec.dispersion.is_none());
     let exposure = record.and_then(|record| record.frame_exposure_s(frames));
     Ok(MovieTask {
         format: *format,
-        shape: spec.shape,
+        shape: spec.frame_shape(),
         window,
         requested: work.window.is_some(),
         scene_fps: exposure.map(|seconds| 1.0 / seconds),
@@ -354,6 +356,7 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
         schedule: full_schedule(&spec.schedule, pilot.as_ref()),
         pilot,
         shape: spec.shape,
+        dispersion: spec.dispersion.clone(),
         inputs: Inputs {
             masks_sha256: calibration.masks,
             masks_axes: calibration.axes.clone(),

@@ -139,9 +139,9 @@ pub(super) fn perform(
             movie::write(file.path(), &task, monitor)?;
             (json(&task.requested.then_some(task.window))?, Output::File(file))
         }
-        TaskInput::Report(masks) => {
+        TaskInput::Report { masks, spectral } => {
             let masks = Reader::open(&masks, &Limits::default()).map_err(IntakeError::from)?;
-            let report = intake::report(&masks, &mut |share| proceed(share, monitor))?;
+            let report = intake::report(&masks, spectral, &mut |share| proceed(share, monitor))?;
             (Value::Null, calibration(None, report, monitor))
         }
     };
@@ -181,6 +181,7 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
         clipped_negatives: calibrated.clipped_negatives,
         mosaic: None,
         reading: None,
+        dispersion: None,
     }
 }
 
@@ -224,7 +225,8 @@ fn white_level(
         let shares = shares.collect::<Result<Vec<_>, _>>()?;
         for k in 0..recipe.shape.frames {
             monitor.check()?;
-            histogram.add(&blend::stored_frame(&recipe.tile_plan, &shares, k)?);
+            let frame = blend::stored_frame(&recipe.tile_plan, &shares, k)?;
+            histogram.add(&recipe.frame(k, frame));
         }
         monitor.reach(TaskStage::Reading, (index + 1) as f64 / f64::from(snapshots.count));
     }

@@ -159,7 +159,11 @@ pub enum TaskInput {
         masks: Box<BlobWriter>,
     },
     /// Make a report on the masks in this prepared array.
-    Report(PathBuf),
+    Report {
+        masks: PathBuf,
+        /// True for the bands of one mask.
+        spectral: bool,
+    },
     /// Write a movie to the file.
     Movie(Box<MovieTask>, StagedPath),
 }

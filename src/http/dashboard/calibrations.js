@@ -108,6 +108,7 @@ function about(item) {
     ["Masks (compression ratio)", item.frames],
     ["Size", `${item.height} × ${item.width} (rows × columns)`],
     ["Sensor", item.mosaic ? `in colour, ${item.mosaic.toUpperCase()}` : "grey"],
+    item.dispersion && ["Dispersion", `one mask for ${item.dispersion.offsets.length} bands, displaced by up to ${figure(Math.max(...item.dispersion.offsets))} pixels along a ${item.dispersion.axis}`],
     ["Mean transmission", figure(item.mask_mean)],
     ["Dead pixels", `${item.dead_pixels} (${figure((100 * item.dead_pixels) / pixels, 2)} %)`],
     ["Values below 0, set to 0", item.clipped_negatives],

@@ -70,11 +70,17 @@ export function nameOf(thing) {
   return thing.label ?? thing.name ?? `unnamed ${short(thing.id)}`;
 }
 
+/** "frame 12", or "band 12 · 540 nm" of a spectral camera. */
+export function frameName({ dispersion }, frame) {
+  const wavelength = dispersion?.wavelengths?.[frame - 1];
+  return `${dispersion ? "band" : "frame"} ${frame}${wavelength === undefined ? "" : ` · ${figure(wavelength, 4)} nm`}`;
+}
+
 /** "8 × 256 × 256", and the number of snapshots if there are several. */
 export function shapeOf(job) {
   const { frames, height, width, mosaic } = job.shape;
   const count = job.snapshots.count;
-  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : ""}${count > 1 ? `, ${count} snapshots` : ""}`;
+  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : job.dispersion ? ", bands" : ""}${count > 1 ? `, ${count} snapshots` : ""}`;
 }
 
 /** Current stage of a job. */

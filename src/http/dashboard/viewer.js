@@ -7,6 +7,7 @@ import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
 import { get, isUnreachable } from "./api.js";
+import { frameName } from "./format.js";
 
 const MODES = [["frame", "Frames"], ["difference", "Difference from the previous frame"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
 
@@ -19,7 +20,7 @@ export class Viewer {
     this.left = new Pane("Measurement", this.view, signal);
     this.leftContrast = new Contrast("measurement", () => this.showLeft());
     this.rightContrast = new Contrast("frames", () => this.showRight());
-    this.player = new Player(frames, signal, () => this.showRight());
+    this.player = new Player(frames, signal, () => this.showRight(), job.dispersion ? (frame) => frameName(job, frame) : undefined);
     this.player.ahead = (frame) => this.mode() === "residual" || this.right.prepare(this.source(frame), ...this.rightContrast.window());
     // With this box checked, playback of a sequence continues with the next snapshot.
     this.through = h("input", { type: "checkbox", id: "through" });
@@ -86,7 +87,8 @@ export class Viewer {
 
   source(frame) {
     const name = this.name(frame);
-    const label = { frame: `Frame ${frame} of ${this.player.count}`, difference: `Difference of frame ${Math.max(2, frame)} from the previous one`, error: `Expected error of frame ${frame}`, residual: "Residual map" }[this.mode()];
+    const called = (number) => frameName(this.job, number);
+    const label = { frame: `${called(frame).replace(/^./, (letter) => letter.toUpperCase())} of ${this.player.count}`, difference: `Difference of ${called(Math.max(2, frame))} from the previous one`, error: `Expected error of ${called(frame)}`, residual: "Residual map" }[this.mode()];
     return { base: `${this.base()}/${name}`, levels: this.levels, tile: this.tile, label };
   }
 

@@ -88,6 +88,7 @@ class Client:
         masks_packing: str | None = None,
         masks_name: str | None = None,
         mosaic: str | None = None,
+        dispersion: Mapping[str, Any] | None = None,
         bad_pixels: Source | None = None,
         dark: Source | Sequence[Source] = (),
         saturation: int | None = None,
@@ -131,6 +132,7 @@ class Client:
                 frames=masks_frames,
                 packing=masks_packing,
                 mosaic=mosaic,
+                dispersion=dispersion,
                 bad_pixels=bad_pixels,
                 name=masks_name,
             )
@@ -176,10 +178,14 @@ class Client:
         frames: tuple[int, int] | None = None,
         packing: str | None = None,
         mosaic: str | None = None,
+        dispersion: Mapping[str, Any] | None = None,
         bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Creates a calibration from masks [B, H, W]. A colour sensor has a `mosaic`.
+
+        A spectral camera has one mask [H, W] and a `dispersion` with `axis` ("column" or "row"), `offsets` (pixels of each
+        band), optionally `wavelengths` (nm), and `mask`: "scene" if the mask has the size of a band, or "measurement".
 
         `array` is the name of the masks in a file of several arrays. `crop` selects a window with `row`, `column`, `height`
         and `width`. `frames` selects the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed"
@@ -193,6 +199,7 @@ class Client:
             "frames": frames,
             "packing": packing,
             "mosaic": mosaic,
+            "dispersion": dispersion,
             "name": name,
             "bad_pixels": None if bad_pixels is None else self.upload(bad_pixels),
         }
@@ -401,7 +408,10 @@ class Calibration(Entity):
         return self
 
     def masks(self) -> npt.NDArray[np.float32]:
-        """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file."""
+        """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file.
+
+        A spectral camera has one mask for each band, as it lies on the sensor.
+        """
         record, name = self.record, self.record["masks"]
         with TemporaryDirectory(prefix="sci-recon-") as folder:
             path = Path(folder) / "masks.npy"
@@ -411,6 +421,8 @@ class Calibration(Entity):
                 if file.read(6) != b"\x93NUMPY":
                     raise ValueError(f"the masks are a {record['format']} file; read it, and pass the array")
             stored = np.load(path)
+        if record["dispersion"]:
+            stored = sheared(stored, record["dispersion"], (record["height"], record["width"]))
         order = (record["axes"] or "frame-row-column").split("-")
         stored = stored.transpose([order.index(axis) for axis in ("frame", "row", "column")])
         masks: npt.NDArray[np.float32] = np.maximum(stored / np.float64(record["full_scale"]), 0).astype(np.float32)
@@ -627,6 +639,19 @@ class Result:
     def manifest(self) -> Record:
         """The manifest of the job: inputs, parameters and results."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
+
+
+def sheared(mask: npt.NDArray[Any], dispersion: Record, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The masks [B, H, W] of the bands on a sensor of this size, from one mask [H, W]."""
+    axis = 1 if dispersion["axis"] == "column" else 0
+    masks = np.zeros((len(dispersion["offsets"]), *size))
+    for band, offset in zip(np.moveaxis(masks, axis + 1, -1), dispersion["offsets"], strict=True):
+        along = np.moveaxis(np.asarray(mask, np.float64).reshape(mask.shape[-2:]), axis, -1)
+        whole, fraction = int(offset), offset - int(offset)
+        for start, weight in ((whole, 1 - fraction), (whole + 1, fraction)):
+            count = max(0, min(along.shape[-1], band.shape[-1] - start))
+            band[:, start : start + count] += weight * along[:, :count]
+    return masks
 
 
 def describe_all(findings: Sequence[Record]) -> list[str]:

@@ -167,6 +167,7 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
     calibration = client.calibrate(
         masks,
         mosaic=options.pop("mosaic", None),
+        dispersion=options.pop("dispersion", None),
         bad_pixels=options.pop("bad_pixels", None),
         **{keyword: options.pop(option, None) for option, keyword in mask_options.items()},
     )

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use ndarray::{Array3, Axis};
 
-use crate::job::{Finding, FindingCode, Mosaic};
+use crate::job::{Dispersion, DispersionAxis, Finding, FindingCode, Mosaic};
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use optics::{
@@ -68,7 +68,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
 /// Errors: files that can't be read.
 pub fn judge(
     (masks, snapshots): (&Path, &Path),
-    mosaic: Option<Mosaic>,
+    (mosaic, dispersion): (Option<Mosaic>, Option<&Dispersion>),
     dark_subtracted: bool,
     limits: &Limits,
 ) -> Result<Vec<Finding>, FormatError> {
@@ -78,7 +78,11 @@ pub fn judge(
     for sample in 0..count.min(SNAPSHOTS) {
         let snapshot = sample * count / count.min(SNAPSHOTS);
         let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
-        let Some(figures) = studied.finish() else { continue };
+        let Some(mut figures) = studied.finish() else { continue };
+        if let Some(dispersion) = dispersion {
+            // Neighbouring bands resemble one another, so the right masks explain hardly more than displaced ones.
+            figures.drift[usize::from(dispersion.axis == DispersionAxis::Column)].excess = 0.0;
+        }
         let number = u32::try_from(snapshot).ok();
         let mut judged = judge_measurement(&figures, dark_subtracted);
         if mosaic.is_none()
@@ -90,6 +94,7 @@ pub fn judge(
         }
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
+        judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
         let judged = judged.into_iter();
         findings
             .extend(judged.map(|finding| Finding { snapshot: number, ..Finding::from(finding) }));

@@ -114,6 +114,7 @@ mod tests {
             calibration: CalibrationId::new(),
             measurement: MeasurementId::new(),
             shape: SceneShape { frames, height: side, width: side, snapshots: 1, mosaic: None },
+            dispersion: None,
             snapshots: SnapshotRange { first: 0, count: 1 },
             sequence: Sequence::Separate,
             run: RunSpec::ALONE,

@@ -27,7 +27,7 @@ pub use ids::{
     WorkerId,
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
-pub use optics::{MARGIN, Mosaic};
+pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::{InvalidPool, Pool};
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;

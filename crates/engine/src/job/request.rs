@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
+use super::Dispersion;
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
@@ -138,7 +139,11 @@ pub struct JobRequest {
 pub struct JobSpec {
     pub calibration: CalibrationId,
     pub measurement: MeasurementId,
+    /// The size of the measurement.
     pub shape: SceneShape,
+    /// Displacement of the bands of a spectral camera.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dispersion: Option<Dispersion>,
     pub snapshots: SnapshotRange,
     /// Temporal relation of the snapshots.
     pub sequence: Sequence,
@@ -219,6 +224,7 @@ impl JobRequest {
             calibration,
             measurement,
             shape,
+            dispersion: None,
             snapshots,
             sequence,
             run,
@@ -281,6 +287,25 @@ impl SnapshotSelection {
 }
 
 impl JobSpec {
+    /// The size of the frames: that of the measurement, or of a band of a spectral camera.
+    pub fn frame_shape(&self) -> SceneShape {
+        self.shape.frame_shape(self.dispersion.as_ref())
+    }
+
+    /// The job for a spectral camera, if there is a dispersion.
+    ///
+    /// Errors: snapshots that are to be reconstructed together.
+    pub fn with_dispersion(
+        self,
+        dispersion: Option<Dispersion>,
+    ) -> Result<Self, Vec<InvalidField>> {
+        if dispersion.is_some() && self.sequence == Sequence::Contiguous {
+            let detail = "the bands of two spectral snapshots do not continue one another: leave the sequence out";
+            return Err(vec![InvalidField::new("/sequence", detail)]);
+        }
+        Ok(Self { dispersion, ..self })
+    }
+
     /// The tile plan, the same for all snapshots.
     ///
     /// Errors: none for a spec from [`JobRequest::resolve`].

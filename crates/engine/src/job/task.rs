@@ -215,7 +215,7 @@ impl JobSpec {
     /// Planned CPU seconds of the movie of one snapshot, or of all snapshots for `None`.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn movie_cost(&self, format: MovieFormat, snapshot: Option<u32>) -> f64 {
-        let SceneShape { frames, height, width, .. } = self.shape;
+        let SceneShape { frames, height, width, .. } = self.frame_shape();
         let snapshots = if snapshot.is_some() { 1 } else { self.snapshots.count as usize };
         let samples = snapshots * frames * height * width * self.shape.channels().count();
         let written = snapshots as u64 * frames as u64 * self.movie_samples();
@@ -239,16 +239,17 @@ impl JobSpec {
 
     /// True if the frames are large enough for a movie in this format.
     pub fn has_movie(&self, format: MovieFormat) -> bool {
-        let SceneShape { height, width, .. } = self.shape;
+        let SceneShape { height, width, .. } = self.frame_shape();
         format == MovieFormat::Gif
             || height.min(width).div_ceil(movie_step(height, width)) >= MIN_MOVIE_SIDE
     }
 
     /// Number of samples in a frame of a movie.
     pub(super) fn movie_samples(&self) -> u64 {
-        let step = movie_step(self.shape.height, self.shape.width);
+        let SceneShape { height, width, .. } = self.frame_shape();
+        let step = movie_step(height, width);
         let side = |length: usize| length.div_ceil(step) as u64;
-        side(self.shape.height) * side(self.shape.width) * self.shape.channels().count() as u64
+        side(height) * side(width) * self.shape.channels().count() as u64
     }
 }
 

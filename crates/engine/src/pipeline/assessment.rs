@@ -124,11 +124,12 @@ const BAD_DB: f64 = 22.0;
 
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
 /// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
-/// of the PSNR. `None` if a tile has none, or if no tile has light.
+/// of the PSNR. With `spectral` frames are bands, which neither move nor have an order in time. `None` if a tile has none, or
+/// if no tile has light.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
-    schedule: &Schedule,
+    (schedule, spectral): (&Schedule, bool),
     (frames, normalisation, white_level): (usize, f32, f32),
     warnings: &[Finding],
 ) -> Option<Expected> {
@@ -143,10 +144,12 @@ pub fn expected(
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
             lit |= !assessed.is_dark();
-            motion = motion.max(assessed.motion);
+            if !spectral {
+                motion = motion.max(assessed.motion);
+                orders.extend(assessed.order);
+            }
             unfamiliar |= assessed.unfamiliar;
             predictions.extend(assessed.prediction);
-            orders.extend(assessed.order);
             let weights = plan.weights(&tile);
             let inside = |at: usize, first: usize, length: usize| {
                 at.checked_sub(first).filter(|at| *at < length)
@@ -421,7 +424,7 @@ mod tests {
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
         let assess_at = |peak, tiles: Vec<Option<TileAssessment>>| {
             let shares = [(shares[0].clone(), tiles)];
-            expected(&plan, &shares, &Schedule::gap_tv(), (2, 0.5, peak), &[])
+            expected(&plan, &shares, (&Schedule::gap_tv(), false), (2, 0.5, peak), &[])
         };
         let assess = |tiles| assess_at(1.0, tiles);
         let tiles =

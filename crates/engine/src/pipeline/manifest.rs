@@ -5,14 +5,15 @@
 
 use std::collections::BTreeMap;
 
+use ndarray::{Array2, Axis};
 use serde::{Serialize, Serializer};
 
-use super::assessment::{Expected, TileAssessment, expected};
+use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::networks::ModelRecord;
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
 use crate::job::{
-    Algorithm, Assessment, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, Mosaic,
-    ResultFile, SceneShape, Schedule, Sha256, TaskKind,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
+    MeasurementId, Mosaic, ResultFile, SceneShape, Schedule, Sha256, TaskKind,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -51,6 +52,8 @@ pub struct Recipe {
     /// The size, which is not serialised here, and the mosaic with the demosaicking method; null for a grey sensor.
     #[serde(rename = "colour", serialize_with = "colour")]
     pub shape: SceneShape,
+    /// Displacement of the bands of a spectral camera; null for frames of a video.
+    pub dispersion: Option<Dispersion>,
     /// Snapshots per second, and exposure time of a snapshot in seconds, where known.
     #[serde(skip)]
     pub camera: (Option<f64>, Option<f64>),
@@ -99,6 +102,14 @@ impl Recipe {
         self.warnings.iter().filter(|warning| concerns(warning)).cloned().collect()
     }
 
+    /// A frame of the result from a reconstructed frame \[H,W\]: of a spectral camera, the band in its place.
+    pub fn frame(&self, k: usize, solved: Array2<f32>) -> Array2<f32> {
+        match &self.dispersion {
+            Some(dispersion) => dispersion.unshear(solved.view(), k),
+            None => solved,
+        }
+    }
+
     /// Predicts the quality of a snapshot, given by its index in the measurement. `shares` has the runs that contain
     /// it, each with the assessments of its tiles in the plan's order. `None` behind a mosaic, for which the model is
     /// not fitted.
@@ -111,7 +122,18 @@ impl Recipe {
             return None;
         }
         let scale = (self.shape.frames, self.scale.normalisation, self.scale.white_level);
-        expected(&self.tile_plan, shares, &self.schedule, scale, &self.warnings_of(snapshot))
+        let input = (&self.schedule, self.dispersion.is_some());
+        let warnings = self.warnings_of(snapshot);
+        let mut expected = expected(&self.tile_plan, shares, input, scale, &warnings)?;
+        if let Some(dispersion) = &self.dispersion {
+            let sensor = (self.shape.height, self.shape.width);
+            let bands = expected.error.outer_iter().enumerate();
+            let bands = bands.map(|(k, error)| dispersion.unshear_blocks(error, k, sensor, BLOCK));
+            let bands: Vec<_> = bands.collect();
+            let views: Vec<_> = bands.iter().map(|band| band.view()).collect();
+            expected.error = ndarray::stack(Axis(0), &views).ok()?;
+        }
+        Some(expected)
     }
 
     /// The manifest of a snapshot, given by its index in the measurement. Its list of files is empty.
@@ -122,10 +144,16 @@ impl Recipe {
         assessment: Option<Assessment>,
         run: RunRecord,
     ) -> Manifest {
-        let SceneShape { frames, height, width, .. } = self.shape;
+        let SceneShape { frames, height, width, .. } =
+            self.shape.frame_shape(self.dispersion.as_ref());
+        // All bands are exposed at the same time.
+        let camera = match self.dispersion {
+            Some(_) => None,
+            None => CameraRecord::new(self.camera, snapshot, frames),
+        };
         let recipe = Self { warnings: self.warnings_of(snapshot), ..self.clone() };
         let content = Content {
-            camera: CameraRecord::new(self.camera, snapshot, frames),
+            camera,
             recipe,
             frames,
             height,
@@ -337,9 +365,11 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
     let exposure = camera.and_then(|camera| camera.frame_exposure_s(content.frames));
     let frame = |k: usize| {
         let mut texts = shared.clone();
-        texts.push(("frame".to_owned(), format!("{} of {}", k + 1, content.frames)));
+        let part = if recipe.dispersion.is_some() { "band" } else { "frame" };
+        texts.push((part.to_owned(), format!("{} of {}", k + 1, content.frames)));
         Attributes {
             texts,
+            wavelength_nm: recipe.dispersion.as_ref().and_then(|bands| bands.wavelength(k)),
             frame_time_s: times.and_then(|times| times.get(k).copied()),
             frames_per_second: exposure.map(|seconds| 1.0 / seconds),
             exposure_s: exposure.map(|seconds| seconds as f32),
@@ -373,6 +403,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),
         runs: SequencePlan::separate(0..2),
         warnings: Vec::new(),
+        dispersion: None,
         camera: (Some(50.0), Some(0.012)),
     };
     recipe.snapshot(1, Vec::new(), None, RunRecord::ended(None, CostRecord::default(), None))
