@@ -31,6 +31,7 @@ pub mod check_model;
 #[cfg(feature = "nats")]
 pub mod cluster;
 pub mod demo;
+pub mod devices;
 pub mod fetch;
 pub mod health;
 pub mod job;
