@@ -10,6 +10,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use super::CliError;
 use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
+use crate::config::device;
 use engine::job::{
     Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, Mosaic, Sequence,
 };
@@ -117,8 +118,8 @@ pub struct NetworkArguments {
     /// Path of libonnxruntime [default: next to the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
-    /// Device that runs networks: cpu, or cuda:0 for the first GPU.
-    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    /// Device that runs networks: cpu, gpu (the first GPU of any vendor), or cuda:N (NVIDIA, from 0).
+    #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = device)]
     device: String,
 }
 
@@ -218,10 +219,16 @@ impl NetworkArguments {
         Ok(())
     }
 
+    /// The networks on the stated device.
+    ///
+    /// # Errors
+    /// The device can't run a network; the text has the remedy.
     pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable counts as not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
-        Ok(NetworkSource::new(library, Device::parse(&self.device)?))
+        let source = NetworkSource::new(library, Device::parse(&self.device)?);
+        source.try_device()?;
+        Ok(source)
     }
 }
 

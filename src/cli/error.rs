@@ -12,6 +12,9 @@ use engine::pipeline::networks::NetworkError;
 use formats::FormatError;
 use reconstruction::ReconError;
 
+/// Exit code of a worker that lost its GPU: EX_TEMPFAIL of sysexits.h.
+pub(super) const DEVICE_LOST: u8 = 75;
+
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
 
 /// Failure of a command. The text is for the user.
@@ -26,6 +29,9 @@ pub enum CliError {
     /// The work is done, but the checks found errors in the input; exit code 3.
     #[error("{0}")]
     ErrorsFound(String),
+    /// A worker lost its GPU, and another process must replace it.
+    #[error("{0}")]
+    DeviceLost(String),
     /// The reader of standard output has closed it. The command then ends with success.
     #[error("standard output is closed")]
     Unread,
@@ -37,6 +43,7 @@ impl CliError {
             Self::Input(_) => ExitCode::from(2),
             Self::Failure(_) => ExitCode::FAILURE,
             Self::ErrorsFound(_) => ExitCode::from(3),
+            Self::DeviceLost(_) => ExitCode::from(DEVICE_LOST),
             Self::Unread => ExitCode::SUCCESS,
         }
     }
@@ -58,9 +65,10 @@ impl From<ReconError> for CliError {
     fn from(error: ReconError) -> Self {
         let text = error.to_string();
         match error {
-            ReconError::Runtime(_) | ReconError::Diverged { .. } | ReconError::Cancelled => {
-                Self::Failure(text)
-            }
+            ReconError::Runtime(_)
+            | ReconError::DeviceLost(_)
+            | ReconError::Diverged { .. }
+            | ReconError::Cancelled => Self::Failure(text),
             _ => Self::Input(text),
         }
     }

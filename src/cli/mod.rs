@@ -32,6 +32,7 @@ pub mod check_model;
 #[cfg(feature = "nats")]
 pub mod cluster;
 pub mod demo;
+pub mod devices;
 pub mod fetch;
 mod fields;
 pub mod health;

@@ -17,7 +17,9 @@ use super::supervisor::Supervisor;
 use crate::audit::AuditLog;
 #[cfg(feature = "nats")]
 use crate::config::{ClusterArguments, RemoteArguments, VERSION};
-use crate::config::{ConfigError, EngineArguments, ServeArguments, Takes, WorkerArguments};
+use crate::config::{
+    ConfigError, DeviceState, EngineArguments, ServeArguments, Takes, WorkerArguments,
+};
 use crate::http::{App, Metrics, listen, router};
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
@@ -110,10 +112,15 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     #[cfg(not(feature = "nats"))]
     let trouble = None;
     let mut lines = vec![workers.clone(); settings.worker_count()];
-    // Clients wait for the checks of their uploads, so these must not wait for tiles.
-    let engine = EngineArguments { nice: 0, ..workers.engine.clone() };
+    // Clients wait for the checks of their uploads, so these must not wait for tiles. Short tasks need no GPU, and checks of
+    // users' networks run where these networks will.
+    let mut engine = EngineArguments { nice: 0, ..workers.engine.clone() };
+    if !engine.unconfined {
+        "cpu".clone_into(&mut engine.device);
+    }
     lines.push(WorkerArguments { takes: Takes::Light, engine, ..workers });
-    let supervisor = Supervisor::start(&store, &program, lines, &stop);
+    let (device, device_state) = watch::channel(DeviceState::Untried);
+    let supervisor = Supervisor::start(&store, &program, lines, &device, &stop);
     let closing = CancellationToken::new();
     let folded = metrics.clone();
     let maintenance =
@@ -134,7 +141,13 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. Serve the API.
-    let app = App::new(store.clone(), (settings, audit), metrics, (trouble, confinement), closing);
+    let app = App::new(
+        store.clone(),
+        (settings, audit),
+        metrics,
+        (trouble, confinement, device_state),
+        closing,
+    );
     let service = router(app);
     tokio::select! {
         () = listen(listener, service, settings, stopped(stop.clone())) => {}
@@ -183,9 +196,7 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
         #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
         takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
-        // The driver of a GPU maps far more memory than it uses.
-        memory_bytes: (settings.engine.device == "cpu")
-            .then(|| allowance(settings.worker_memory_bytes)),
+        memory_bytes: Some(allowance(settings.worker_memory_bytes)),
         engine: settings.engine.clone(),
         log_format: settings.log_format,
         id: None,

@@ -17,7 +17,7 @@ use super::rendering::Pictures;
 use super::revocation::Revocations;
 use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
-use crate::config::ServeArguments;
+use crate::config::{DeviceState, ServeArguments};
 use engine::job::{Timestamp, TokenId, without_paths};
 use formats::Limits;
 use store::Store;
@@ -59,19 +59,22 @@ pub struct Services {
     pub(super) cluster: Option<watch::Receiver<Option<String>>>,
     /// Why networks of users can read files of labs, if they can.
     pub(super) confinement: std::result::Result<(), String>,
+    /// State of the device that runs networks.
+    pub(super) device: watch::Receiver<DeviceState>,
 }
 
 impl App {
     /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine, none if
-    /// none should; `confinement` why networks of users can read files of labs, if they can. Answers that
+    /// none should; `confinement` why networks of users can read files of labs, if they can; `device` the state of the workers' device. Answers that
     /// have no end of their own end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
         (settings, audit): (&ServeArguments, AuditLog),
         metrics: Metrics,
-        (cluster, confinement): (
+        (cluster, confinement, device): (
             Option<watch::Receiver<Option<String>>>,
             std::result::Result<(), String>,
+            watch::Receiver<DeviceState>,
         ),
         closing: CancellationToken,
     ) -> Self {
@@ -90,6 +93,7 @@ impl App {
             metrics,
             cluster,
             confinement,
+            device,
             settings: settings.clone(),
             audit,
             store,
@@ -111,7 +115,11 @@ impl App {
         let elsewhere = self.settings.without_tiles() || self.settings.workers == Some(0);
         // Workers that others start bring their own.
         let found = if elsewhere { Ok(()) } else { self.settings.engine.check_library() };
-        found.map_err(|error| without_paths(&error.to_string()))
+        found.map_err(|error| without_paths(&error.to_string()))?;
+        match &*self.device.borrow() {
+            DeviceState::Refused(reason) => Err(without_paths(reason)),
+            DeviceState::Untried | DeviceState::Ready => Ok(()),
+        }
     }
 }
 

@@ -31,6 +31,7 @@ mod downloads;
 mod exports;
 mod faults;
 mod formats;
+mod gpu;
 mod hangs;
 mod hostile;
 mod identity;

@@ -35,14 +35,21 @@ pub struct Local {
     store: Store,
     worker: WorkerId,
     claimant: Claimant<'static>,
+    /// Device of its networks, for the list of workers.
+    device: String,
     /// Opened at the first use.
     watcher: Arc<Mutex<Option<Watcher>>>,
 }
 
 impl Local {
-    /// A transport for the worker `worker`, which takes the tasks that `claimant` may claim.
-    pub fn new(store: Store, worker: WorkerId, claimant: Claimant<'static>) -> Self {
-        Self { store, worker, claimant, watcher: Arc::default() }
+    /// A transport for the worker `worker` with networks on `device`, which takes the tasks that `claimant` may claim.
+    pub fn new(
+        store: Store,
+        worker: WorkerId,
+        claimant: Claimant<'static>,
+        device: String,
+    ) -> Self {
+        Self { store, worker, claimant, device, watcher: Arc::default() }
     }
 
     fn arrays(&self, masks: Sha256, snapshots: Sha256) -> Arrays {
@@ -167,7 +174,8 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        let (location, takes) = (WorkerPlace::default(), self.claimant.takes());
+        let location = WorkerPlace { device: Some(self.device.clone()), ..WorkerPlace::default() };
+        let takes = self.claimant.takes();
         Ok(self.store.worker_started(self.worker, std::process::id(), &location, takes).await?)
     }
 

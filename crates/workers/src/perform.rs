@@ -256,6 +256,7 @@ fn tile(
     monitor: &Monitor,
 ) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
     let Engines { networks, models } = engines;
+    let model_provider = models.command().provider;
     let before_fetch = cpu_seconds();
     // Fetches all files of the task, including the network's.
     let input = transport.window(task)?;
@@ -282,7 +283,10 @@ fn tile(
     let source = networks.source();
     let (process_seconds, process_peak) = process.map_or((0.0, 0), |process| process.bill());
     let cost = CostRecord {
-        provider: uses_network.then(|| source.provider().into()),
+        provider: uses_network.then(|| match task.model {
+            Some(_) => model_provider.into(),
+            None => source.provider().into(),
+        }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
         cpu_seconds: cpu_seconds() - before + process_seconds,
         peak_rss_bytes: peak_rss_bytes() + process_peak,

@@ -23,6 +23,7 @@ use engine::pipeline::movie::MovieTask;
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::tile::TileInput;
 use formats::{DiskTrouble, FormatError};
+use reconstruction::ReconError;
 use reconstruction::assessment::Evidence;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
@@ -245,6 +246,11 @@ impl TaskError {
                 store.or_else(|| format.and_then(FormatError::disk_trouble))
             }
         }
+    }
+
+    /// True if the process must be replaced, because it can't use its device again.
+    pub(super) fn is_device_loss(&self) -> bool {
+        matches!(self, Self::Pipeline(PipelineError::Recon(ReconError::DeviceLost(_))))
     }
 
     pub(super) fn is_retryable(&self) -> bool {

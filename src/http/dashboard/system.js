@@ -62,10 +62,10 @@ function workers(found) {
   const title = `Workers: ${found.workers.length} of ${found.workers_wanted}`;
   if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait."));
   const row = (worker) => h("tr", null,
-    h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version),
+    h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version), h("td", null, worker.device ?? ""),
     h("td", null, task(worker.task)),
     h("td", { title: momentInFull(worker.started_at) }, moment(worker.started_at)));
-  const heads = ["Worker", "Process", "Version", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
+  const heads = ["Worker", "Process", "Version", "Device", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
   return card(title, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Workers" },
     h("table", null, h("thead", null, h("tr", null, heads)), h("tbody", null, found.workers.map(row)))));
 }
