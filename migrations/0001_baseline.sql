@@ -234,6 +234,7 @@ CREATE TABLE jobs (
     calibration  TEXT NOT NULL REFERENCES calibrations (id),
     measurement  TEXT NOT NULL REFERENCES measurements (id),
     model        TEXT REFERENCES models (id),
+    truth        TEXT REFERENCES blobs (sha256), -- the true frames, if they are known
     label        TEXT,
     spec         TEXT NOT NULL, -- JobSpec as JSON
     state        TEXT NOT NULL CHECK (state IN
@@ -261,6 +262,7 @@ CREATE INDEX jobs_finished ON jobs (finished_at, id) WHERE finished_at IS NOT NU
 CREATE INDEX jobs_calibration ON jobs (calibration);
 CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
+CREATE INDEX jobs_truth ON jobs (truth) WHERE truth IS NOT NULL;
 
 CREATE TABLE removals (
     -- Files whose rows are deleted, until the files are removed. A start after a kill continues with them.
@@ -620,7 +622,7 @@ BEGIN
     INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
 END;
 
-CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority ON jobs
+CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority, truth ON jobs
 BEGIN
     INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
 END;

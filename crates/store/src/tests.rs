@@ -179,6 +179,7 @@ impl Lab {
             schedule: None,
             tile: Some(TileSpec { size: 64, overlap: 8 }),
             priority,
+            truth: None,
             label: None,
         };
         let sequence = measurement.sequence;

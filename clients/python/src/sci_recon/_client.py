@@ -103,6 +103,7 @@ class Client:
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
         priority: int = 0,
+        truth: Source | None = None,
         label: str | None = None,
         key: str | None = None,
         folder: str | os.PathLike[str] | None = None,
@@ -155,6 +156,7 @@ class Client:
             tile=tile,
             model=model,
             priority=priority,
+            truth=truth,
             label=label,
             key=key,
         ).wait()
@@ -280,12 +282,14 @@ class Client:
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
         priority: int = 0,
+        truth: Source | None = None,
         label: str | None = None,
         key: str | None = None,
     ) -> Job:
         """Submits a job without waiting for it.
 
-        `snapshots` is "all", an index from 0, or (first, last), both included. A repeated request with the same `key`
+        `snapshots` is "all", an index from 0, or (first, last), both included. `truth` [B, H, W] has the true frames, if they
+        are known: the dashboard shows PSNR and SSIM against them. A repeated request with the same `key`
         returns the job of the first one.
         """
         return Job(
@@ -301,6 +305,7 @@ class Client:
                 tile=tile,
                 model=model,
                 priority=priority,
+                truth=None if truth is None else self.upload(truth),
                 label=label,
             ),
         )

@@ -122,6 +122,7 @@ mod tests {
             schedule: algorithm.default_schedule(),
             tile: TileSpec { size: side, overlap: 0 },
             priority: 0,
+            truth: None,
             label: None,
             warnings: Vec::new(),
         }

@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
+use super::Sha256;
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
@@ -124,6 +125,10 @@ pub struct JobRequest {
     #[serde(default)]
     #[schemars(range(min = -100, max = 100))]
     pub priority: i32,
+    /// An upload with the true frames of the selected snapshots' measurement, if they are known. PSNR and SSIM are
+    /// relative to them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub truth: Option<Sha256>,
     /// A name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub label: Option<Label>,
@@ -147,6 +152,8 @@ pub struct JobSpec {
     pub schedule: Schedule,
     pub tile: TileSpec,
     pub priority: i32,
+    /// The upload with the true frames.
+    pub truth: Option<Sha256>,
     pub label: Option<Label>,
     pub warnings: Vec<Finding>,
 }
@@ -209,7 +216,7 @@ impl JobRequest {
             return Err(errors);
         }
         let (measurement, algorithm) = (self.measurement, self.algorithm);
-        let (priority, label) = (self.priority, self.label);
+        let (priority, truth, label) = (self.priority, self.truth, self.label);
         let spec = JobSpec {
             calibration,
             measurement,
@@ -222,6 +229,7 @@ impl JobRequest {
             schedule,
             tile,
             priority,
+            truth,
             label,
             warnings: Vec::new(),
         };
