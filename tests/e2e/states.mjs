@@ -48,6 +48,7 @@ export async function faults(browser, checks, program, services) {
   await checks.look(page, "jobs-states");
   await page.click("text=damaged");
   await page.waitForSelector("h1:has-text('damaged')");
+  await page.click(".head button.more");
   await page.click("text=Rename");
   await page.fill("#new-name", "another name");
   await page.keyboard.press("Enter");

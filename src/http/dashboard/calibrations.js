@@ -10,6 +10,8 @@ import { every } from "./live.js";
 import { exact, figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
 import { grade, report } from "./report.js";
+import { menu } from "./menu.js";
+import { tileValues } from "./values.js";
 
 export async function calibrations(root, _, signal) {
   const list = h("ul", { class: "tiling" });
@@ -64,11 +66,10 @@ export async function calibration(root, [id], signal) {
     call(item);
     put(buttons,
       item.state === "ready" && h("a", { class: "button primary", href: `#/new?calibration=${id}` }, "Use for a new job"),
-      h("button", { type: "button", onclick: () => rename(item.name, async (name) => {
+      menu(`More actions for ${nameOf(item)}`, [h("button", { type: "button", class: "small", onclick: () => rename(item.name, async (name) => {
         Object.assign(item, await send("PATCH", `/v1/calibrations/${id}`, { name }));
         call(item);
-      }) }, "Rename"),
-      h("button", { type: "button", class: "delete", onclick: () => erase(item) }, "Delete"));
+      }) }, "Rename"), h("button", { type: "button", class: "small delete", onclick: () => erase(item) }, "Delete")]));
     if (item.state !== "ready") {
       put(body, h("p", { class: item.state === "failed" ? "trouble" : "note" }, unready(item)));
       return;
@@ -154,6 +155,8 @@ class Masks {
     this.spread = await get(`/view/calibrations/${this.item.id}/pictures/${one ? "mask-1" : this.choice.value}/spread`, this.signal);
     this.contrast.offer(this.spread);
     this.draw();
+    const { base } = this.source(one ? "mask-1" : this.choice.value);
+    tileValues(base, this.spread.levels, 0, 0).then((values) => this.contrast.distribution(values)).catch(() => {});
   }
 
   draw() {

@@ -65,7 +65,8 @@ export function dropZone(id, title, hint, signal, take, many = false) {
 export function problem(error, about = null) {
   const errors = error.errors ?? [];
   const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: ${item.detail}`))) : null;
-  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : error.message, list);
+  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : error.message, list,
+    error.code && error.code !== "unknown" && h("p", null, h("a", { href: `/problems/${error.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
 }
 
 const SCALES = [1, 255, 1023, 4095, 16383, 65535];
