@@ -440,9 +440,13 @@ export async function captures(page, checks, scene) {
   await page.waitForSelector("text=The measurement fits the calibration.");
   await page.selectOption("#algorithm", "gap-tv");
   await page.fill("#label", "from captures");
+  await page.click("summary:has-text('True frames')");
+  await page.setInputFiles("#truth", file("truth.npy", scene.truth));
+  await page.waitForSelector(".drop:has-text('truth.npy: ')");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
   await state(page, "succeeded");
+  await page.waitForSelector(".quality:has-text('PSNR measured')");
   const { pathname } = new URL(await page.$eval("a[href^='#/calibrations/']", (link) => `http://x/${link.getAttribute("href").slice(1)}`));
   return pathname;
 }

@@ -11,7 +11,7 @@ import { exact, figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
 import { grade, report } from "./report.js";
 import { menu } from "./menu.js";
-import { tileValues } from "./values.js";
+import { sampled } from "./values.js";
 
 export async function calibrations(root, _, signal) {
   const list = h("ul", { class: "tiling" });
@@ -71,7 +71,8 @@ export async function calibration(root, [id], signal) {
         call(item);
       }) }, "Rename"), h("button", { type: "button", class: "small delete", onclick: () => erase(item) }, "Delete")]));
     if (item.state !== "ready") {
-      put(body, h("p", { class: item.state === "failed" ? "trouble" : "note" }, unready(item)));
+      const failed = item.state === "failed";
+      put(body, h("p", { class: failed ? "trouble" : "note" }, unready(item)), failed && h("p", null, h("a", { href: "#/new" }, "Create another calibration")));
       return;
     }
     const masks = new Masks(item, signal);
@@ -156,7 +157,7 @@ class Masks {
     this.contrast.offer(this.spread);
     this.draw();
     const { base } = this.source(one ? "mask-1" : this.choice.value);
-    tileValues(base, this.spread.levels, 0, 0).then((values) => this.contrast.distribution(values)).catch(() => {});
+    sampled({ base, ...this.spread }).then((values) => this.contrast.distribution(values)).catch(() => {});
   }
 
   draw() {

@@ -9,7 +9,7 @@ import { announce, h, put, say } from "./dom.js";
 import { bytes, duration, expectedRange, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
 import { isAborted, get, send, upload } from "./api.js";
 import { networks, ran } from "./provenance.js";
-import { tileValues } from "./values.js";
+import { sampled } from "./values.js";
 
 export async function compare(root, [path], signal) {
   const ids = path.split("/");
@@ -19,7 +19,7 @@ export async function compare(root, [path], signal) {
   const manifests = await Promise.all(jobs.map((job) => manifest(job, signal)));
   const all = manifests.every(Boolean);
   if (!same) {
-    root.append(h("p", { class: "trouble" }, `These jobs can't be compared frame by frame: their frames are ${jobs.map(shapeOf).join(" and ")}.`));
+    root.append(h("p", { class: "trouble" }, `These jobs can't be compared frame by frame: their frames are ${jobs.map(shapeOf).join(" and ")}. `, h("a", { href: "#/jobs" }, "Select other jobs")));
   } else if (all) {
     const group = new Group(jobs, signal);
     root.append(group.element);
@@ -98,7 +98,7 @@ class Group {
       h("div", { class: "row", role: "group", "aria-label": "Mode of comparison" }, this.modes, this.pairing, this.wipe, this.gain, this.rateLabel,
         h("span", { class: "grow" }), h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit")),
       this.panels, this.player.element,
-      h("div", { class: "row" }, h("label", { for: "match", class: "row" }, this.match, "Match scale"), this.scales),
+      h("div", { class: "row matching" }, h("label", { for: "match", class: "row" }, this.match, "Match scale"), this.scales),
       h("div", { class: `panes of${jobs.length} contrasts` }, this.contrasts.map((contrast) => contrast.element)),
       h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. Drag the line of the wipe, or use its slider.")));
     this.player.keys(this.element);
@@ -145,7 +145,7 @@ class Group {
     say(this.scales, ratio > MAX_RATIO
       ? `The brightest frames are ${figure(ratio, 2)} times as bright as the darkest. With “Match scale” each job is shown on its own scale.`
       : "Off: all jobs share one contrast, so that differences in brightness are visible. On: each job has its own.");
-    spreads.forEach(({ levels }, index) => tileValues(this.base(index, middle), levels, 0, 0).then((values) => this.contrasts[index].distribution(values)).catch(() => {}));
+    spreads.forEach((spread, index) => sampled({ base: this.base(index, middle), ...spread }).then((values) => this.contrasts[index].distribution(values)).catch(() => {}));
     this.rescale();
     this.choose("beside");
   }

@@ -49,13 +49,15 @@ export class Contrast {
     if (this.spread) this.show();
   }
 
-  /** Draws the distribution of values. */
+  /** Draws the distribution of values, given as arrays. */
   distribution(values) {
     this.values = values;
     const [from, to] = this.range();
     const counts = Array(BINS).fill(0);
-    // Pixels that are not computed yet have no value.
-    for (const value of values.filter(Number.isFinite)) counts[Math.min(BINS - 1, Math.max(0, Math.floor((BINS * (value - from)) / (to - from))))] += 1;
+    for (const value of values.flatMap((part) => [...part])) {
+      // Pixels that are not computed yet have no value.
+      if (value >= from && value <= to) counts[Math.min(BINS - 1, Math.floor((BINS * (value - from)) / (to - from)))] += 1;
+    }
     // The square root keeps rare values visible.
     const most = Math.sqrt(Math.max(...counts, 1));
     const path = counts.map((count, bin) => `M${bin} 1V${(1 - Math.sqrt(count) / most).toFixed(3)}H${bin + 1}V1`).join("");

@@ -58,7 +58,12 @@ export function dropZone(id, title, hint, signal, take, many = false) {
     event.preventDefault();
     start([...event.dataTransfer.files]);
   });
-  return { element: h("div", null, zone, status), status };
+  /** Shows that no file is held. */
+  const clear = () => {
+    say(text, hint);
+    put(status);
+  };
+  return { element: h("div", null, zone, status), status, clear };
 }
 
 /** An error message with all invalid fields. */

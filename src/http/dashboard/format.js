@@ -70,11 +70,11 @@ export function nameOf(thing) {
   return thing.label ?? thing.name ?? `unnamed ${short(thing.id)}`;
 }
 
-/** "8 × 256 × 256", and the number of snapshots if there are several. */
-export function shapeOf(job) {
+/** "8 × 256 × 256", and with `all` the number of snapshots if there are several. */
+export function shapeOf(job, all = true) {
   const { frames, height, width, mosaic } = job.shape;
   const count = job.snapshots.count;
-  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : ""}${count > 1 ? `, ${count} snapshots` : ""}`;
+  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : ""}${all && count > 1 ? `, ${count} snapshots` : ""}`;
 }
 
 /** Current stage of a job. */

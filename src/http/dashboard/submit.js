@@ -12,7 +12,7 @@ import { glance } from "./calibrations.js";
 const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
 
 export async function submit(root, [query], signal) {
-  const form = { calibration: null, measurement: null };
+  const form = { calibration: null, measurement: null, truth: null };
   const [known, algorithms] = await Promise.all([get("/v1/calibrations?limit=200", signal), get("/v1/algorithms", signal)]);
   const button = h("button", { type: "submit", class: "primary large", disabled: true }, "Submit the job");
   const result = h("div", { "aria-live": "polite" });
@@ -249,7 +249,7 @@ function jobStep(algorithms, form, signal) {
   const priority = numberField("priority", "Priority (−100 to 0; admins up to 100)", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
-  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value() }) });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth }) });
   const ask = calmly(250, async () => {
     if (!form.measurement || signal.aborted) return;
     const asked = JSON.stringify(request());
@@ -266,9 +266,19 @@ function jobStep(algorithms, form, signal) {
     if (!form.measurement) put(estimate);
     ask();
   };
+  const truth = dropZone("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, async (blob) => {
+    form.truth = blob.sha256;
+    ask();
+  });
+  const forget = h("button", { type: "button", class: "small", onclick: () => {
+    form.truth = null;
+    truth.clear();
+    ask();
+  } }, "Remove the true frames");
   select.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan, estimate);
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan,
+    h("details", null, h("summary", null, "True frames"), truth.element, h("div", { class: "row" }, forget)), estimate);
   queueMicrotask(renew);
   return { element, renew, request };
 }

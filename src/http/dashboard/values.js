@@ -26,6 +26,16 @@ async function load(path) {
   return new Float32Array(await response.arrayBuffer());
 }
 
+/** Values of up to four tiles of a picture at full resolution, spread over it, for its histogram. */
+export async function sampled({ base, height, width, version }) {
+  const places = (side) => {
+    const count = Math.ceil(side / TILE);
+    return Array.from({ length: Math.min(2, count) }, (_, index) => Math.floor(((index + 0.5) * count) / Math.min(2, count)));
+  };
+  const at = places(height).flatMap((row) => places(width).map((column) => [row, column]));
+  return Promise.all(at.map(([row, column]) => tileValues(base, 0, row, column, version)));
+}
+
 /** Value of a pixel: one number, or three of a colour picture. `picture` has `base`, `height`, `width` and `version`. */
 export async function pixel(picture, row, column) {
   const [tileRow, tileColumn] = [Math.floor(row / TILE), Math.floor(column / TILE)];

@@ -9,7 +9,7 @@ import { View } from "./view.js";
 import { figure } from "./format.js";
 import { get, isUnreachable } from "./api.js";
 import { Probe } from "./probe.js";
-import { tileValues } from "./values.js";
+import { sampled } from "./values.js";
 
 const MODES = [["frame", "Frames"], ["difference", "Difference from the previous frame"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
 
@@ -201,10 +201,10 @@ export class Viewer {
     return this.spreads.get(name);
   }
 
-  /** Draws the histogram of a picture, from its values at the coarsest level. */
-  async distribute(contrast, base, spread, version) {
+  /** Draws the histogram of a picture. */
+  async distribute(contrast, base, { height, width }, version) {
     try {
-      contrast.distribution(await tileValues(base, spread.levels, 0, 0, version));
+      contrast.distribution(await sampled({ base, height, width, version }));
     } catch {
       // The contrast works without its histogram.
     }
