@@ -49,7 +49,7 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
       black: npy([height, width], new Float32Array(pixels).fill(BLACK)),
     }),
     measurement: npy([1, height, width], measurement),
-    /** The same snapshot several times. */
+    /** A file with the snapshot `count` times. */
     repeated: (count) => npy([count, height, width], Float32Array.from({ length: count * pixels }, (_, at) => measurement[at % pixels])),
     /** The snapshot in the middle of a larger picture, with a border of this many pixels. */
     framed: (border) => {
