@@ -447,6 +447,10 @@ export async function captures(page, checks, scene) {
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
   await state(page, "succeeded");
   await page.waitForSelector(".quality:has-text('PSNR measured')");
+  await page.click("text=Remove the true frames");
+  await page.click("dialog button.danger");
+  await page.waitForSelector(".verdictcard label:has-text('Attach true frames')");
+  checks.that((await page.$(".quality:has-text('PSNR measured')")) === null, "true frames can be removed from the job");
   const { pathname } = new URL(await page.$eval("a[href^='#/calibrations/']", (link) => `http://x/${link.getAttribute("href").slice(1)}`));
   return pathname;
 }

@@ -5,7 +5,7 @@ import { h, put } from "./dom.js";
 /** A button "⋯" with a list of `items`, which are buttons. The list is above all other content, so that no cell clips it. */
 export function menu(label, items) {
   const list = h("div", { class: "menu", popover: "auto" }, items);
-  const button = h("button", { type: "button", class: "small more", "aria-label": label, title: label, "aria-haspopup": "true", "aria-expanded": "false" }, "⋯");
+  const button = h("button", { type: "button", class: "small more", "aria-label": label, title: label, "aria-expanded": "false" }, "⋯");
   button.popoverTargetElement = list;
   list.addEventListener("beforetoggle", (event) => {
     button.setAttribute("aria-expanded", String(event.newState === "open"));

@@ -1,6 +1,7 @@
 // The card "Is it good?": findings of the checks, grade of the calibration, expected PSNR, and the PSNR and
 // SSIM against true frames if they are attached.
 
+import { ask } from "./actions.js";
 import { aboutDecibels, bytes, expectedRange, figure, verdictOf } from "./format.js";
 import { h, put, say } from "./dom.js";
 import { findings } from "./report.js";
@@ -93,6 +94,7 @@ export class Verdict {
   }
 
   async remove() {
+    if (!(await ask("Remove the true frames?", "Nobody will see the measured PSNR of this job. The uploaded file is kept.", "Remove"))) return;
     try {
       await this.change(null);
       this.unmeasured();
