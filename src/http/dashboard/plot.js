@@ -26,7 +26,7 @@ export function plot(values, { xName, yName, first = 0, width = 560 }) {
   const whole = ticks(first, first + values.length - 1, 8).filter(Number.isInteger);
   const path = values.map((value, index) => `${index ? "L" : "M"}${x(index).toFixed(1)} ${y(value).toFixed(1)}`).join("");
   return s("svg", { viewBox: `0 0 ${width} ${HEIGHT}`, class: "plot", role: "img", "aria-label": `${yName} over ${xName}: ${figure(low)} to ${figure(high)}` },
-    ticks(from, to, 4).map((mark) => [s("line", { x1: LEFT, x2: width - RIGHT, y1: y(mark), y2: y(mark), class: "grid" }), s("text", { x: LEFT - 6, y: y(mark) + 4, "text-anchor": "end" }, figure(mark))]),
+    ticks(from, to, 6).map((mark) => [s("line", { x1: LEFT, x2: width - RIGHT, y1: y(mark), y2: y(mark), class: "grid" }), s("text", { x: LEFT - 6, y: y(mark) + 4, "text-anchor": "end" }, figure(mark))]),
     whole.map((mark) => s("text", { x: x(mark - first), y: HEIGHT - BOTTOM + 15, "text-anchor": "middle" }, mark)),
     s("text", { x: (LEFT + width - RIGHT) / 2, y: HEIGHT - 4, "text-anchor": "middle" }, xName),
     s("path", { d: path, class: "line residual" }),

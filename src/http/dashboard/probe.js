@@ -130,7 +130,7 @@ export class Probe {
       const inUnit = `value in ${words.replace("× ", "")}`;
       const shown = values.map((value) => value * factor);
       const file = `${this.name()}_${place.replaceAll(/[^0-9a-z]+/gi, "_")}.csv`;
-      put(this.result, plot(shown, { xName, yName: inUnit, first }), h("div", { class: "row" }, h("span", { class: "muted" }, `${place}: ${inUnit}`), csvLink(file, [xName, "value"], shown.map((value, index) => [first + index, value]))));
+      put(this.result, plot(shown, { xName, yName: inUnit, first, width: Math.min(560, this.result.clientWidth || 560) }), h("div", { class: "row" }, h("span", { class: "muted" }, `${place}: ${inUnit}`), csvLink(file, [xName, "value"], shown.map((value, index) => [first + index, value]))));
     } catch (error) {
       if (asked === this.asked && !isAborted(error)) put(this.result, h("p", { class: "warn" }, error.message));
     }
