@@ -79,9 +79,11 @@ export class Contrast {
     this.show();
   }
 
+  /** Ends of the scale: the values of the picture and the window that it begins with. */
   range() {
-    const { minimum, maximum } = this.spread;
-    return [minimum, maximum > minimum ? maximum : minimum + 1];
+    const { minimum, maximum, low, high } = this.spread;
+    const [from, to] = [Math.min(minimum, low), Math.max(maximum, high)];
+    return [from, to > from ? to : from + 1];
   }
 
   at(value) {
