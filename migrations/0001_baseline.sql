@@ -236,6 +236,7 @@ CREATE TABLE jobs (
     calibration  TEXT NOT NULL REFERENCES calibrations (id),
     measurement  TEXT NOT NULL REFERENCES measurements (id),
     model        TEXT REFERENCES models (id),
+    truth        TEXT REFERENCES blobs (sha256), -- the true frames, if they are known
     label        TEXT,
     spec         TEXT NOT NULL, -- JobSpec as JSON
     state        TEXT NOT NULL CHECK (state IN
@@ -263,6 +264,7 @@ CREATE INDEX jobs_finished ON jobs (finished_at, id) WHERE finished_at IS NOT NU
 CREATE INDEX jobs_calibration ON jobs (calibration);
 CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
+CREATE INDEX jobs_truth ON jobs (truth) WHERE truth IS NOT NULL;
 
 CREATE TABLE notifications (
     -- Unsent notifications of jobs that have ended.
@@ -639,7 +641,7 @@ BEGIN
     INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
 END;
 
-CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority ON jobs
+CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority, truth ON jobs
 BEGIN
     INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
 END;

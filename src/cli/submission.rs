@@ -112,6 +112,9 @@ pub(super) struct SubmissionArguments {
     /// From -100 to 100; jobs of higher priority are served first.
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, help_heading = JOB)]
     priority: i32,
+    /// True frames [frame, row, column] of this snapshot, or of all. PSNR and SSIM are relative to them.
+    #[arg(long, value_name = "FILE", help_heading = JOB)]
+    truth: Option<PathBuf>,
     /// Label of the job [default: none; of watch-folder: the name of the file].
     #[arg(long, value_name = "TEXT", help_heading = JOB)]
     label: Option<String>,
@@ -132,12 +135,12 @@ pub(super) struct Recipe {
 }
 
 impl SubmissionArguments {
-    /// Files that belong to each snapshot: the masks, the map of bad pixels and the dark captures.
+    /// Files that belong to each snapshot: the masks, the map of bad pixels, the dark captures and the true frames.
     pub(super) fn own_files(&self) -> impl Iterator<Item = &PathBuf> {
-        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark)
+        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark).chain(&self.truth)
     }
 
-    /// Uploads masks and dark captures, creates the calibration if necessary, and returns the requests.
+    /// Uploads masks, dark captures and true frames, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
         let dispersion = self.dispersion.resolve()?;
@@ -166,8 +169,12 @@ impl SubmissionArguments {
             }
         };
         let dark = self.send_dark(client).await?;
+        let truth = match &self.truth {
+            Some(frames) => Some(client.upload_with_bar(frames).await?),
+            None => None,
+        };
         let measurement = self.measurement_request(&calibration, &dark);
-        Ok(Recipe { measurement, job: self.job_request(schedule) })
+        Ok(Recipe { measurement, job: self.job_request(schedule, truth) })
     }
 
     /// Uploads the dark captures that the service does not have, or has deleted as unused.
@@ -217,7 +224,7 @@ impl SubmissionArguments {
     }
 
     /// A request for a job, without its measurement.
-    fn job_request(&self, schedule: Value) -> Map<String, Value> {
+    fn job_request(&self, schedule: Value, truth: Option<Sha256>) -> Map<String, Value> {
         let tile = self.tile.zip(self.overlap);
         let tile = tile.map(|(size, overlap)| json!({"size": size, "overlap": overlap}));
         let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.into_str()))]);
@@ -227,6 +234,7 @@ impl SubmissionArguments {
         add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
         add(&mut body, "tile", json!(tile));
         add(&mut body, "priority", json!(self.priority));
+        add(&mut body, "truth", json!(truth));
         add(&mut body, "label", json!(self.label));
         add(&mut body, "webhook", json!(self.webhook));
         body
@@ -341,6 +349,7 @@ mod tests {
             ("tile", "128"),
             ("overlap", "16"),
             ("priority", "-3"),
+            ("truth", "t.npy"),
             ("label", "milk"),
             ("webhook", "https://lab.example/hook"),
         ];
@@ -364,7 +373,7 @@ mod tests {
         assert_eq!(names(calibration.as_object().unwrap()), expected);
         let measurement = arguments.measurement_request("id", &[sha256]);
         assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
-        let job = arguments.job_request(arguments.schedule().unwrap());
+        let job = arguments.job_request(arguments.schedule().unwrap(), Some(sha256));
         // The measurement names the calibration.
         assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
         assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));

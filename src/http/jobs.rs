@@ -16,10 +16,11 @@ use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
+use super::quality;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
     JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape,
-    Schedule, Sequence, SnapshotRange, TileSpec, Timestamp, Webhook, priority_error,
+    Schedule, Sequence, Sha256, SnapshotRange, TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
@@ -49,6 +50,8 @@ pub(super) struct JobBody {
     schedule: Schedule,
     tile: TileSpec,
     priority: i32,
+    /// The upload with the true frames; null if they are unknown.
+    truth: Option<Sha256>,
     /// Findings of the check of the measurement, and `bad_calibration`.
     warnings: Vec<Finding>,
     /// The failure in words.
@@ -179,6 +182,7 @@ impl JobBody {
             schedule: spec.schedule,
             tile: spec.tile,
             priority: spec.priority,
+            truth: spec.truth,
             warnings: spec.warnings,
             error: job.error,
             problem,
@@ -240,6 +244,10 @@ pub(super) struct Changes {
     /// From -100 to 100; above 0 with the role admin alone.
     #[schemars(range(min = -100, max = 100))]
     priority: Option<i32>,
+    /// The upload with the true frames. Null removes it from the job; the upload is kept.
+    #[serde(default, with = "serde_with::rust::double_option")]
+    #[schemars(with = "Option<Sha256>")]
+    truth: Option<Option<Sha256>>,
 }
 
 /// Predicted cost of a job.
@@ -346,6 +354,9 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     check_memory(app, &spec)?;
     check_networks(app, &spec)?;
     check_webhook(app, &spec)?;
+    if let Some(truth) = spec.truth {
+        quality::check(app, lab, truth, spec.frame_shape()).await?;
+    }
     Ok(spec)
 }
 
@@ -481,14 +492,18 @@ pub(super) async fn change(
     request: RequestContext,
     Body(changes): Body<Changes>,
 ) -> Result<Response> {
-    let Changes { label, priority } = changes;
+    let Changes { label, priority, truth } = changes;
     let invalid = priority.and_then(|to| priority_error(to).or_else(|| role_error(&access, to)));
     if let Some(error) = invalid {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
     let _guard =
         request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
-    app.store.change_job(&access.lab, id, &JobChanges { label, priority }).await?;
+    if let Some(Some(sha256)) = truth {
+        let shape = app.store.job(&access.lab, id).await?.spec.frame_shape();
+        quality::check(&app, &access.lab, sha256, shape).await?;
+    }
+    app.store.change_job(&access.lab, id, &JobChanges { label, priority, truth }).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 

@@ -7,6 +7,7 @@ use axum::response::Response;
 use ndarray::{Array2, Axis};
 use serde::{Deserialize, Serialize};
 
+use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf};
@@ -14,7 +15,7 @@ use super::intake;
 use super::jobs::with_snapshot;
 use super::results::{result_file, white_level};
 use engine::intake::{Opened, Source};
-use engine::job::{JobId, SceneShape, Sha256};
+use engine::job::{JobId, Lab, SceneShape, Sha256};
 use engine::pipeline::quality::{FrameQuality, Quality};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, FormatError, Limits, npy};
@@ -22,7 +23,8 @@ use formats::{Axes, Channels, FormatError, Limits, npy};
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct QualityQuery {
-    truth: Sha256,
+    /// By default the truth of the job.
+    truth: Option<Sha256>,
     full_scale: Option<f32>,
     axes: Option<Axes>,
 }
@@ -44,25 +46,68 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
-    app.store.upload(&access.lab, query.truth).await?;
+    let QualityQuery { truth, full_scale, axes } = query;
+    let truth = truth.or(job.spec.truth).ok_or_else(|| {
+        let detail = "the job has no true frames: state an upload as truth in the query, or attach it to \
+                      the job with PATCH";
+        ApiError::new(Code::InvalidQuery, detail)
+    })?;
+    app.store.upload(&access.lab, truth).await?;
     result_file(&app, &job, Some(snapshot), "frames.npy").await?;
     let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
-    let (shape, truth) = (job.spec.frame_shape(), query.truth);
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
-    let limits = app.limits;
+    let (shape, limits) = (job.spec.frame_shape(), app.limits);
     let frames = intake::run(&app, &access.lab, move || {
-        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, limits);
-        // The truth of a colour sensor may have colours, or one colour for each pixel, as the sensor records it.
-        let colours = if shape.mosaic.is_some() { truth.open_colours()? } else { None };
-        if let Some(colours) = colours {
-            return compare((&path, Channels::Rgb), colours, snapshot as usize, shape);
-        }
-        let truth = truth.arranged(query.axes, Some((shape.height, shape.width)));
-        compare((&path, Channels::Grey), truth.open()?, snapshot as usize, shape)
+        let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
+        compare((&path, channels), truth, snapshot as usize, shape)
     });
     let quality: Quality = frames.await?.into();
     let peak = white_level(&app, id).await?.unwrap_or(1.0);
     conditional::json(&QualityBody { truth, peak, quality: quality.relative_to(peak) }, &headers)
+}
+
+/// Checks that an upload can be the true frames of a job with this shape.
+///
+/// Errors: those of the file, at `/truth`.
+pub(super) async fn check(app: &App, lab: &Lab, truth: Sha256, shape: SceneShape) -> Result<()> {
+    let found = app.store.upload(lab, truth).await;
+    found.map_err(|error| ApiError::reference("/truth", error))?;
+    let upload = intake::upload(app, truth).await.map_err(|error| error.at("/truth"))?;
+    let limits = app.limits;
+    let opened =
+        intake::run(app, lab, move || open(&upload, (None, None), limits, shape).map(drop)).await;
+    opened.map_err(|error| error.at("/truth"))
+}
+
+/// Opens true frames, of one snapshot or of all, and checks their number and size. The truth of a colour sensor may have
+/// colours, or one colour for each pixel, as the sensor records it.
+fn open(
+    path: &Path,
+    (full_scale, axes): (Option<f32>, Option<Axes>),
+    limits: Limits,
+    shape: SceneShape,
+) -> Result<(Opened, Channels)> {
+    let source = Source::upload(path, SceneArray::Truth, full_scale, limits);
+    let colours = if shape.mosaic.is_some() { source.open_colours()? } else { None };
+    let (truth, channels) = match colours {
+        Some(colours) => (colours, Channels::Rgb),
+        None => {
+            let source = source.arranged(axes, Some((shape.height, shape.width)));
+            (source.open()?, Channels::Grey)
+        }
+    };
+    let SceneShape { frames, height, width, snapshots, .. } = shape;
+    let (all, info) = (frames * snapshots as usize, &truth.info);
+    let (rows, columns) = (info.height, info.width / channels.count());
+    if (rows, columns) == (height, width) && [frames, all].contains(&info.frames) {
+        return Ok((truth, channels));
+    }
+    let detail = format!(
+        "the truth has {} frames of {rows}x{columns}; it should have {frames} of {height}x{width} for one \
+         snapshot, or {all} for all",
+        info.frames
+    );
+    Err(ApiError::new(Code::SizeMismatch, detail))
 }
 
 /// Compares the frames of a snapshot with true frames, of this snapshot or of all snapshots of the measurement. Memory holds
@@ -74,19 +119,8 @@ fn compare(
     shape: SceneShape,
 ) -> Result<Vec<FrameQuality>> {
     let SceneShape { frames, height, snapshots, mosaic, .. } = shape;
-    let width = shape.width * channels.count();
-    let info = truth.info;
-    let all = frames * snapshots as usize;
-    if (info.height, info.width) != (height, width) || ![frames, all].contains(&info.frames) {
-        let (rows, columns) = (info.height, info.width / channels.count());
-        let detail = format!(
-            "the truth has {} frames of {rows}x{columns}; it should have {frames} of {height}x{} for this \
-             snapshot, or {all} for all",
-            info.frames, shape.width
-        );
-        return Err(ApiError::new(Code::SizeMismatch, detail));
-    }
-    let skipped = if info.frames == all { snapshot * frames } else { 0 };
+    let has_all = truth.info.frames == frames * snapshots as usize;
+    let skipped = if has_all { snapshot * frames } else { 0 };
     for _ in 0..skipped {
         next(&mut truth)?;
     }

@@ -41,7 +41,7 @@ pub(super) struct SampleBody {
     masks: Sha256,
     /// The file of the measurement.
     data: Sha256,
-    /// The file of the true frames, for `quality`.
+    /// The file of the true frames, which belong to the job.
     truth: Sha256,
     job: JobBody,
 }
@@ -83,6 +83,7 @@ pub(super) async fn create(
         schedule: None,
         tile: None,
         priority: 0,
+        truth: Some(truth),
         label: request.label,
         webhook: None,
     };

@@ -13,7 +13,7 @@ export async function faults(browser, checks, program, services) {
   services.push(service);
   const [own, foreign] = [scene(8, 96, 128, 1), scene(8, 96, 128, 77)];
   const { calibration } = await service.take(own);
-  const data = await service.call("POST", "/v1/blobs", foreign.measurement);
+  const data = await service.call("POST", "/v1/blobs", foreign.repeated(3));
   const measurement = await service.call("POST", "/v1/measurements", { calibration, data: data.sha256, exposure_s: 0.1 });
   const bad = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "wrong masks" });
   await service.when(bad.id, (job) => job.state === "succeeded");
@@ -21,7 +21,9 @@ export async function faults(browser, checks, program, services) {
   await page.goto(`${service.url}/#/jobs/${bad.id}`);
   await page.waitForSelector(".judgement.bad, .judgement.usable");
   checks.that(/Bad|Doubtful/.test(await page.textContent(".judgement")), "the verdict warns");
-  checks.that((await page.textContent(".findings")).includes("What to do:"), "a finding shows its remedy");
+  const found = await page.$$eval(".verdictcard .findings li", (lines) => lines.map((line) => line.textContent));
+  checks.that(found.join().includes("What to do:"), "a finding shows its remedy");
+  checks.that(found.filter((line) => line.includes("3 snapshots (0 to 2)")).length > 0 && !found.some((line) => /Snapshot [012]:/.test(line)), `a finding of all snapshots is one line: ${found}`);
   await page.waitForSelector("text=10 times slower than real time");
   await page.click("text=True speed");
   await page.waitForSelector("text=in real time");
@@ -50,6 +52,7 @@ export async function faults(browser, checks, program, services) {
   await checks.look(page, "jobs-states");
   await page.click("text=damaged");
   await page.waitForSelector("h1:has-text('damaged')");
+  await page.click(".head button.more");
   await page.click("text=Rename");
   await page.fill("#new-name", "another name");
   await page.keyboard.press("Enter");
@@ -121,6 +124,8 @@ export async function phone(browser, checks, url, job) {
   const page = await checks.page(context);
   await page.goto(`${url}/#/jobs/${job}`);
   await page.waitForSelector(".downloads a");
+  // The measured PSNR comes last, and moves the frames down.
+  await page.waitForSelector(".quality:has-text('measured')");
   await page.$eval("[aria-label=Frames] .sight", (sight) => sight.scrollIntoView({ block: "center" }));
   await page.waitForTimeout(600);
   const wire = await context.newCDPSession(page);

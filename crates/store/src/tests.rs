@@ -180,6 +180,7 @@ impl Lab {
             schedule: None,
             tile: Some(TileSpec { size: 64, overlap: 8 }),
             priority,
+            truth: None,
             label: None,
             webhook: None,
         };

@@ -106,6 +106,7 @@ class Client:
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
         priority: int = 0,
+        truth: Source | None = None,
         label: str | None = None,
         webhook: str | None = None,
         key: str | None = None,
@@ -160,6 +161,7 @@ class Client:
             tile=tile,
             model=model,
             priority=priority,
+            truth=truth,
             label=label,
             webhook=webhook,
             key=key,
@@ -289,13 +291,15 @@ class Client:
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
         priority: int = 0,
+        truth: Source | None = None,
         label: str | None = None,
         webhook: str | None = None,
         key: str | None = None,
     ) -> Job:
         """Submits a job without waiting for it.
 
-        `snapshots` is "all", an index from 0, or (first, last), both included. A repeated request with the same `key`
+        `snapshots` is "all", an index from 0, or (first, last), both included. `truth` [B, H, W] has the true frames, if they
+        are known: the dashboard shows PSNR and SSIM against them. A repeated request with the same `key`
         returns the job of the first one. The service notifies `webhook`, an address, when the job ends.
         """
         return Job(
@@ -311,6 +315,7 @@ class Client:
                 tile=tile,
                 model=model,
                 priority=priority,
+                truth=None if truth is None else self.upload(truth),
                 label=label,
                 webhook=webhook,
             ),

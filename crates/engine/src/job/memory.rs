@@ -123,6 +123,7 @@ mod tests {
             schedule: algorithm.default_schedule(),
             tile: TileSpec { size: side, overlap: 0 },
             priority: 0,
+            truth: None,
             label: None,
             webhook: None,
             warnings: Vec::new(),

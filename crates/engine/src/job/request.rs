@@ -5,7 +5,6 @@ use std::borrow::Cow;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
-use super::Dispersion;
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
@@ -13,6 +12,7 @@ use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
 use super::webhook::Webhook;
+use super::{Dispersion, Sha256};
 use reconstruction::ReconError;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::SequencePlan;
@@ -126,6 +126,10 @@ pub struct JobRequest {
     #[serde(default)]
     #[schemars(range(min = -100, max = 100))]
     pub priority: i32,
+    /// An upload with the true frames of the selected snapshots' measurement, if they are known. PSNR and SSIM are
+    /// relative to them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub truth: Option<Sha256>,
     /// A name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub label: Option<Label>,
@@ -156,6 +160,8 @@ pub struct JobSpec {
     pub schedule: Schedule,
     pub tile: TileSpec,
     pub priority: i32,
+    /// The upload with the true frames.
+    pub truth: Option<Sha256>,
     pub label: Option<Label>,
     pub webhook: Option<Webhook>,
     pub warnings: Vec<Finding>,
@@ -219,7 +225,8 @@ impl JobRequest {
             return Err(errors);
         }
         let (measurement, algorithm) = (self.measurement, self.algorithm);
-        let (priority, label, webhook) = (self.priority, self.label, self.webhook);
+        let (priority, truth) = (self.priority, self.truth);
+        let (label, webhook) = (self.label, self.webhook);
         let spec = JobSpec {
             calibration,
             measurement,
@@ -233,6 +240,7 @@ impl JobRequest {
             schedule,
             tile,
             priority,
+            truth,
             label,
             webhook,
             warnings: Vec::new(),

@@ -188,6 +188,7 @@ impl Recipe {
             run: JobRun {
                 run: RunRecord::ended(Some(job.to_string()), cost, None),
                 label: spec.label.clone(),
+                truth_sha256: spec.truth,
                 calibration: spec.calibration,
                 measurement: spec.measurement,
                 tasks: seconds.len() + 1,
@@ -332,6 +333,8 @@ struct JobRun {
     #[serde(flatten)]
     run: RunRecord,
     label: Option<Label>,
+    /// The upload with the true frames; null if they are unknown.
+    truth_sha256: Option<Sha256>,
     calibration: CalibrationId,
     measurement: MeasurementId,
     /// Number of tasks.
