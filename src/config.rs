@@ -23,6 +23,9 @@ pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {
     None => env!("CARGO_PKG_VERSION"),
 };
 
+/// Exit code of a worker that lost its GPU: EX_TEMPFAIL of sysexits.h.
+pub(crate) const DEVICE_LOST: u8 = 75;
+
 /// Run the HTTP service, its dashboard and its workers.
 #[derive(Debug, Clone, Args)]
 pub struct ServeArguments {

@@ -68,7 +68,7 @@ impl DispersionArguments {
         };
         match dispersion.check() {
             Ok(()) => Ok(Some(dispersion)),
-            Err(error) => Err(CliError::Input(format!("--dispersion: {}", error.detail)).into()),
+            Err(error) => Err(CliError::Input(format!("--dispersion: {}", error.detail))),
         }
     }
 }

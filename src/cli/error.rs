@@ -6,14 +6,12 @@ use std::process::ExitCode;
 
 use super::fields::{Role, as_options};
 use super::serve::ServeError;
+use crate::config::DEVICE_LOST;
 use engine::intake::IntakeError;
 use engine::pipeline::PipelineError;
 use engine::pipeline::networks::NetworkError;
 use formats::FormatError;
 use reconstruction::ReconError;
-
-/// Exit code of a worker that lost its GPU: EX_TEMPFAIL of sysexits.h.
-pub(super) const DEVICE_LOST: u8 = 75;
 
 pub type Result<T, E = CliError> = std::result::Result<T, E>;
 

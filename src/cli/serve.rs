@@ -20,7 +20,7 @@ use crate::config::{ClusterArguments, RemoteArguments, VERSION};
 use crate::config::{
     ConfigError, DeviceState, EngineArguments, ServeArguments, Takes, WorkerArguments,
 };
-use crate::http::{App, Metrics, listen, router};
+use crate::http::{App, Machine, Metrics, listen, router};
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
 use workers::nats::{
@@ -141,13 +141,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. Serve the API.
-    let app = App::new(
-        store.clone(),
-        (settings, audit),
-        metrics,
-        (trouble, confinement, device_state),
-        closing,
-    );
+    let machine = Machine { cluster: trouble, confinement, device: device_state };
+    let app = App::new(store.clone(), (settings, audit), metrics, machine, closing);
     let service = router(app);
     tokio::select! {
         () = listen(listener, service, settings, stopped(stop.clone())) => {}

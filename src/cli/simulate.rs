@@ -211,7 +211,7 @@ impl Arguments {
         } else {
             return Ok(dispersion);
         };
-        Err(CliError::Input(format!("--dispersion-offsets: {problem}")).into())
+        Err(CliError::Input(format!("--dispersion-offsets: {problem}")))
     }
 }
 
@@ -223,7 +223,7 @@ fn on_sensor(
     let displaced = images.outer_iter().enumerate().map(|(k, image)| displace(image, k));
     let displaced: Vec<_> = displaced.collect();
     let views: Vec<_> = displaced.iter().map(|image| image.view()).collect();
-    Ok(ndarray::stack(Axis(0), &views).map_err(|error| CliError::Failure(error.to_string()))?)
+    ndarray::stack(Axis(0), &views).map_err(|error| CliError::Failure(error.to_string()))
 }
 
 /// Simulates one measurement for each `B` frames of the truth.

@@ -14,8 +14,7 @@ use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::error::DEVICE_LOST;
-use crate::config::{DeviceState, Takes, WorkerArguments};
+use crate::config::{DEVICE_LOST, DeviceState, Takes, WorkerArguments};
 use engine::job::WorkerId;
 use engine::pipeline::usage::{kills_for_memory, peak_rss_of};
 use store::{Store, WorkerEnd};

@@ -16,7 +16,7 @@ use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
-use super::quality;
+use super::truth;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
     JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape,
@@ -355,7 +355,7 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     check_networks(app, &spec)?;
     check_webhook(app, &spec)?;
     if let Some(truth) = spec.truth {
-        quality::check(app, lab, truth, spec.frame_shape()).await?;
+        truth::check(app, lab, truth, spec.frame_shape()).await?;
     }
     Ok(spec)
 }
@@ -501,7 +501,7 @@ pub(super) async fn change(
         request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     if let Some(Some(sha256)) = truth {
         let shape = app.store.job(&access.lab, id).await?.spec.frame_shape();
-        quality::check(&app, &access.lab, sha256, shape).await?;
+        truth::check(&app, &access.lab, sha256, shape).await?;
     }
     app.store.change_job(&access.lab, id, &JobChanges { label, priority, truth }).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)

@@ -51,12 +51,13 @@ mod submissions;
 mod system;
 mod throttle;
 mod tiles;
+mod truth;
 mod turnover;
 pub mod tus;
 mod upload;
 mod write_deadline;
 
-pub use app::App;
+pub use app::{App, Machine};
 pub use listen::listen;
 pub use metrics::Metrics;
 pub use router::{Route, router, routes};

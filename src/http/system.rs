@@ -163,7 +163,7 @@ pub(super) async fn live() -> Json<Liveness> {
 pub(super) async fn ready(State(app): State<App>) -> Response {
     let checks =
         [database_answers(&app).await, disk_takes_files(&app).await, workers_live(&app).await];
-    let cluster = app.cluster.as_ref().map(|trouble| trouble.borrow().clone());
+    let cluster = app.machine.cluster.as_ref().map(|trouble| trouble.borrow().clone());
     let tiles_continue = matches!(cluster, None | Some(None)) || !app.settings.without_tiles();
     let ready = checks.iter().all(Result::is_ok) && tiles_continue;
     let [database, disk, workers] =
@@ -176,7 +176,7 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
     let tiles = tiles.err().unwrap_or_else(|| "ok".to_owned());
     let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
     let cluster = cluster.map(|trouble| trouble.unwrap_or_else(|| "ok".to_owned()));
-    let confinement = app.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
+    let confinement = app.machine.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
     let device = device_state(&app);
     let body = Readiness {
         ready,
@@ -196,7 +196,7 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
 /// The device of this machine's workers, with its state in words.
 fn device_state(app: &App) -> String {
     let device = &app.settings.engine.device;
-    match &*app.device.borrow() {
+    match &*app.machine.device.borrow() {
         // The CPU is always there.
         _ if device == "cpu" => device.clone(),
         DeviceState::Ready => format!("{device}: a worker has run a network on it"),
