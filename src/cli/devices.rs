@@ -58,7 +58,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let cards = cards(Path::new("/"));
     let trials: Vec<Trial> = TRIED.iter().map(|&device| attempt(arguments, device)).collect();
     if arguments.json {
-        return print_line(serde_json::json!({"cards": cards, "devices": trials}));
+        print_line(serde_json::json!({"cards": cards, "devices": trials}))?;
+        return verdict(&trials);
     }
     print_line("Graphics cards:")?;
     if cards.is_empty() {
@@ -79,8 +80,13 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         };
         print_line(format!("  --device {device}: {outcome}"))?;
     }
-    let failed = !trials.iter().any(|trial| trial.usable);
-    if failed { Err(CliError::Failure("no device can be used".into())) } else { Ok(()) }
+    verdict(&trials)
+}
+
+/// Fails if no device can be used.
+fn verdict(trials: &[Trial]) -> Result<()> {
+    let is_usable = trials.iter().any(|trial| trial.usable);
+    is_usable.then_some(()).ok_or_else(|| CliError::Failure("no device can be used".into()))
 }
 
 /// Tries to run a network on a device.
