@@ -1,0 +1,476 @@
+//! Registration of masks that have moved since their calibration.
+//!
+//! The displacement is the one at which a short reconstruction predicts pixels best that it has not seen. Whole pixels are
+//! searched first. Then a quadratic is fitted to the hold-out error around the best displacement, on ever finer grids. The
+//! error itself is minimised, because a linearised step is biased towards 0 by the errors of the frames.
+//!
+//! A correction is accepted only if it lowers the error significantly at pixels that took no part in the search.
+
+use std::ops::Range;
+
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut1, Axis, s};
+use rand::{Rng, SeedableRng};
+
+use super::crop;
+use super::error::{ReconError, Result, shape_text};
+use super::hold_out::{HoldOut, t_statistic};
+use super::operator::SensingOperator;
+use super::schedule::Schedule;
+use super::solver;
+
+/// Largest displacement along each axis that is searched, in pixels.
+pub const REACH: usize = 4;
+/// Pixels around a window that its interpolation needs: the spline's filter falls below 1e-7 within 12 pixels.
+pub const MARGIN: usize = 12 + REACH + 1;
+/// Shortest side in pixels of a piece that is compared.
+const SHORTEST_SIDE: usize = 32;
+/// Share of pixels that are held out.
+const SHARE: f64 = 0.1;
+/// Iterations of total variation in the search by whole pixels, and in the refinement.
+const ITERATIONS: (usize, usize) = (8, 24);
+/// Distances in pixels between the displacements of the refinement.
+const STEPS: [f64; 4] = [0.5, 0.25, 0.125, 0.125];
+/// Smallest t-statistic of an accepted correction.
+const SIGNIFICANT: f64 = 3.0;
+/// Smallest correction in pixels; a smaller one changes nothing that can be seen.
+const SMALLEST: f64 = 0.03;
+
+/// The displacement of masks against their calibration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Registration {
+    /// Pixels by which the masks have moved down and to the right.
+    pub shift: [f64; 2],
+    /// Standard error of each.
+    pub uncertainty: [f64; 2],
+    /// `||y - Hv||^2 / ||y||^2` at hold-out pixels with the masks of the calibration.
+    pub error_before: f64,
+    /// The same with the moved masks.
+    pub error_after: f64,
+    /// True if the masks are corrected by this shift. False if the masks fit.
+    pub applied: bool,
+}
+
+/// The rows and columns of the piece on which masks are registered, in a measurement `y` \[H,W\] behind masks with the sum
+/// `light` \[H,W\]: a crop as [`crop::choose`] selects it, with a margin around it. `None` if the picture is too small.
+pub fn choose(
+    light: ArrayView2<'_, f32>,
+    y: ArrayView2<'_, f32>,
+) -> Option<(Range<usize>, Range<usize>)> {
+    let (height, width) = y.dim();
+    if height.min(width) < SHORTEST_SIDE + 2 * MARGIN {
+        return None;
+    }
+    let inner = s![MARGIN..height - MARGIN, MARGIN..width - MARGIN];
+    let (rows, columns) = crop::choose(light.slice(inner), y.slice(inner));
+    Some((rows.start..rows.end + 2 * MARGIN, columns.start..columns.end + 2 * MARGIN))
+}
+
+/// Estimates the displacement from a piece of the masks \[B,h,w\] and of a measurement \[h,w\] on the scale on which the
+/// scene is on \[0,1\]; see [`choose`]. NaN were not measured. `proceed` gets the finished share, and returns false to stop.
+/// `None` if no light reaches the piece.
+///
+/// # Errors
+/// Sizes that disagree or are too small, [`ReconError::Cancelled`], or those of [`solver::reconstruct`].
+pub fn register(
+    masks: ArrayView3<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    proceed: &mut dyn FnMut(f64) -> bool,
+) -> Result<Option<Registration>> {
+    let (_, height, width) = masks.dim();
+    if y.dim() != (height, width) || height.min(width) < SHORTEST_SIDE + 2 * MARGIN {
+        return Err(ReconError::Shape {
+            what: "the piece of a registration",
+            found: format!("{} and {}", shape_text(masks.shape()), shape_text(y.shape())),
+            expected: format!("one size of at least {} pixels", SHORTEST_SIDE + 2 * MARGIN),
+        });
+    }
+    let inner = s![MARGIN..height - MARGIN, MARGIN..width - MARGIN];
+    let masks = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
+    let y = y.slice(inner).insert_axis(Axis(0)).to_owned();
+    let draws = [draw(&y, 0), draw(&y, 1)];
+    if draws.iter().any(|draw| draw.pixels.is_empty()) {
+        return Ok(None);
+    }
+    let splines = Splines::new(masks.view());
+    let total =
+        ((2 * REACH + 1).pow(2) * ITERATIONS.0 + (STEPS.len() * 9 + 2) * ITERATIONS.1) as f64;
+    let mut search = Search { masks, splines, y, proceed, done: 0.0, total };
+    let Some(mut best) = search.whole_pixels(&draws[0])? else { return Ok(None) };
+    let mut uncertainty = [0.0; 2];
+    for step in STEPS {
+        let Some(fit) = search.refine(best, step, &draws[0])? else { return Ok(None) };
+        (best, uncertainty) = (fit.minimum, fit.uncertainty);
+    }
+    // The other draw took no part in the search, so its errors are not biased by it.
+    let (before, after) = (
+        search.errors([0.0; 2], &draws[1], ITERATIONS.1)?,
+        search.errors(best, &draws[1], ITERATIONS.1)?,
+    );
+    let (Some(before), Some(after)) = (before, after) else { return Ok(None) };
+    let norm = draws[1].norm(search.y.view());
+    let length = best[0].hypot(best[1]);
+    let within = best.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
+    Ok(Some(Registration {
+        shift: best,
+        uncertainty,
+        error_before: before.iter().sum::<f64>() / norm,
+        error_after: after.iter().sum::<f64>() / norm,
+        applied: within && length >= SMALLEST && t_statistic(&before, &after) >= SIGNIFICANT,
+    }))
+}
+
+/// Hold-out pixels of the draw `index` in a measurement \[1,h,w\].
+fn draw(y: &Array3<f32>, index: u64) -> HoldOut {
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(index);
+    let drawn = y.indexed_iter().filter(|(_, value)| random.random_bool(SHARE) && !value.is_nan());
+    HoldOut { pixels: drawn.map(|(pixel, _)| pixel).collect() }
+}
+
+struct Search<'a> {
+    /// Masks \[B,h,w\] of the piece with its margin.
+    masks: Array3<f32>,
+    splines: Splines,
+    /// Measurement \[1,h,w\] of the piece without its margin.
+    y: Array3<f32>,
+    proceed: &'a mut dyn FnMut(f64) -> bool,
+    /// Finished iterations.
+    done: f64,
+    total: f64,
+}
+
+/// The minimum of a quadratic that was fitted to hold-out errors.
+struct Fit {
+    minimum: [f64; 2],
+    uncertainty: [f64; 2],
+}
+
+impl Search<'_> {
+    /// Squared hold-out errors with masks that are moved by `shift`; `None` if the masks are dark or the solver diverges.
+    fn errors(
+        &mut self,
+        shift: [f64; 2],
+        hold_out: &HoldOut,
+        iterations: usize,
+    ) -> Result<Option<Vec<f64>>> {
+        if !(self.proceed)((self.done / self.total).min(1.0)) {
+            return Err(ReconError::Cancelled);
+        }
+        self.done += iterations as f64;
+        let (_, height, width) = self.masks.dim();
+        let inner = (MARGIN..height - MARGIN, MARGIN..width - MARGIN);
+        let masks = if shift.iter().all(|shift| shift.fract() == 0.0) {
+            let start = |axis: usize| (MARGIN as i64 - shift[axis] as i64) as usize;
+            let (_, rows, columns) = self.y.dim();
+            let (row, column) = (start(0), start(1));
+            self.masks.slice(s![.., row..row + rows, column..column + columns]).to_owned()
+        } else {
+            self.splines.window(shift, inner.0, inner.1)
+        };
+        let whole = match SensingOperator::new(masks) {
+            Err(ReconError::DarkMasks { .. }) => return Ok(None),
+            other => other?,
+        };
+        let op = whole.clone().without(&hold_out.pixels);
+        let schedule = Schedule::gap_tv().with_iterations(iterations);
+        match solver::reconstruct(&op, self.y.view(), &schedule, &mut (), &mut ()) {
+            Err(ReconError::Diverged { .. }) => Ok(None),
+            outcome => Ok(Some(hold_out.residuals(&whole, self.y.view(), outcome?.frames.view()))),
+        }
+    }
+
+    /// The shift by whole pixels with the smallest error.
+    fn whole_pixels(&mut self, hold_out: &HoldOut) -> Result<Option<[f64; 2]>> {
+        let reach = REACH as i32;
+        let mut best: Option<(f64, [f64; 2])> = None;
+        for row in -reach..=reach {
+            for column in -reach..=reach {
+                let shift = [f64::from(row), f64::from(column)];
+                let Some(errors) = self.errors(shift, hold_out, ITERATIONS.0)? else { continue };
+                let error: f64 = errors.iter().sum();
+                if best.is_none_or(|(smallest, _)| error < smallest) {
+                    best = Some((error, shift));
+                }
+            }
+        }
+        Ok(best.map(|(_, shift)| shift))
+    }
+
+    /// Fits a quadratic to the errors on a grid of 3x3 shifts around `centre`. The minimum lies within the grid.
+    fn refine(&mut self, centre: [f64; 2], step: f64, hold_out: &HoldOut) -> Result<Option<Fit>> {
+        let mut grid = Vec::with_capacity(9);
+        for place in 0..9 {
+            let (row, column) = (f64::from(place / 3 - 1), f64::from(place % 3 - 1));
+            let limit = (REACH + 1) as f64;
+            let shift = [centre[0] + step * row, centre[1] + step * column];
+            let shift = shift.map(|value| value.clamp(-limit, limit));
+            match self.errors(shift, hold_out, ITERATIONS.1)? {
+                Some(errors) => grid.push(errors),
+                None => return Ok(None),
+            }
+        }
+        let sums: Vec<f64> = grid.iter().map(|errors| errors.iter().sum()).collect();
+        let quadratic = Quadratic::fit(|place| sums[place]);
+        let offset = quadratic.minimum().unwrap_or_else(|| {
+            let smallest = (0..9).min_by(|a, b| sums[*a].total_cmp(&sums[*b])).unwrap_or(4);
+            [smallest as f64 / 3.0, smallest as f64 % 3.0].map(|place| place.floor() - 1.0)
+        });
+        let gradients = (0..grid[0].len()).map(|pixel| {
+            let quadratic = Quadratic::fit(|place| grid[place][pixel]);
+            quadratic.gradient_at(offset)
+        });
+        let uncertainty = quadratic.uncertainty(gradients).map(|value| value * step);
+        let minimum = [centre[0] + step * offset[0], centre[1] + step * offset[1]];
+        Ok(Some(Fit { minimum, uncertainty }))
+    }
+}
+
+/// `c + g.d + d.H d / 2` on a grid of 3x3 places `d` from -1 to 1.
+struct Quadratic {
+    gradient: [f64; 2],
+    /// Second derivatives along rows, columns, and both.
+    curvature: [f64; 3],
+}
+
+impl Quadratic {
+    /// The least-squares fit to values in row order.
+    fn fit(value: impl Fn(usize) -> f64) -> Self {
+        let sum = |weight: &dyn Fn(f64, f64) -> f64| {
+            let place = |place: usize| ((place / 3) as f64 - 1.0, (place % 3) as f64 - 1.0);
+            (0..9).map(|at| weight(place(at).0, place(at).1) * value(at)).sum::<f64>()
+        };
+        let gradient = [sum(&|row, _| row) / 6.0, sum(&|_, column| column) / 6.0];
+        let curvature = [
+            sum(&|row, _| row * row - 2.0 / 3.0),
+            sum(&|_, column| column * column - 2.0 / 3.0),
+            sum(&|row, column| row * column) / 4.0,
+        ];
+        Self { gradient, curvature }
+    }
+
+    /// The minimum within the grid; `None` if the quadratic has none.
+    fn minimum(&self) -> Option<[f64; 2]> {
+        let inverse = self.inverse()?;
+        let [row, column] = self.gradient;
+        let at =
+            [-(inverse[0] * row + inverse[2] * column), -(inverse[2] * row + inverse[1] * column)];
+        Some(at.map(|value| value.clamp(-1.0, 1.0)))
+    }
+
+    /// The inverse of a positive definite curvature.
+    fn inverse(&self) -> Option<[f64; 3]> {
+        let [rows, columns, both] = self.curvature;
+        let determinant = rows * columns - both * both;
+        let is_convex = rows > 0.0 && columns > 0.0 && determinant > 0.0;
+        is_convex.then(|| [columns / determinant, rows / determinant, -both / determinant])
+    }
+
+    fn gradient_at(&self, [row, column]: [f64; 2]) -> [f64; 2] {
+        let ([g0, g1], [rows, columns, both]) = (self.gradient, self.curvature);
+        [g0 + rows * row + both * column, g1 + both * row + columns * column]
+    }
+
+    /// Standard errors of the minimum of a sum of quadratics with these gradients; the step of the grid if it has none.
+    fn uncertainty(&self, gradients: impl Iterator<Item = [f64; 2]>) -> [f64; 2] {
+        let Some([rows, columns, both]) = self.inverse() else { return [1.0; 2] };
+        let (mut row, mut column) = (0.0, 0.0);
+        for gradient in gradients {
+            row += (rows * gradient[0] + both * gradient[1]).powi(2);
+            column += (both * gradient[0] + columns * gradient[1]).powi(2);
+        }
+        [row.sqrt(), column.sqrt()]
+    }
+}
+
+/// Cubic splines through masks \[B,h,w\].
+pub struct Splines {
+    /// Coefficients \[B,h,w\].
+    coefficients: Array3<f32>,
+}
+
+impl Splines {
+    /// Splines that continue the masks by reflection. NaN count as 0.
+    pub fn new(masks: ArrayView3<'_, f32>) -> Self {
+        let mut coefficients = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
+        for axis in [Axis(1), Axis(2)] {
+            coefficients.lanes_mut(axis).into_iter().for_each(filter);
+        }
+        Self { coefficients }
+    }
+
+    /// A window of the masks after they moved down and to the right by `shift`, clipped to \[0,1\]. A pixel that no part of
+    /// the masks has moved onto is NaN.
+    pub fn window(
+        &self,
+        shift: [f64; 2],
+        rows: Range<usize>,
+        columns: Range<usize>,
+    ) -> Array3<f32> {
+        let (frames, height, width) = self.coefficients.dim();
+        let taps = |range: Range<usize>, shift: f64, length: usize| -> Vec<Taps> {
+            range.map(|place| Taps::at(place, shift, length)).collect()
+        };
+        let (rows, columns) = (taps(rows, shift[0], height), taps(columns, shift[1], width));
+        let mut window = Array3::zeros((frames, rows.len(), columns.len()));
+        let mut between = Array2::zeros((rows.len(), width));
+        for (mut out, plane) in window.outer_iter_mut().zip(self.coefficients.outer_iter()) {
+            between.fill(0.0);
+            for (mut line, taps) in between.outer_iter_mut().zip(&rows) {
+                for (&place, &weight) in taps.places.iter().zip(&taps.weights) {
+                    line.scaled_add(weight, &plane.row(place));
+                }
+            }
+            for (mut out, line) in out.outer_iter_mut().zip(between.outer_iter()) {
+                for (out, taps) in out.iter_mut().zip(&columns) {
+                    let places = taps.places.iter().zip(&taps.weights);
+                    let value: f32 = places.map(|(&place, &weight)| weight * line[place]).sum();
+                    *out = value.clamp(0.0, 1.0);
+                }
+            }
+        }
+        window
+    }
+}
+
+/// True if part of masks of this length, moved by `shift`, lies on the pixel `place`.
+pub fn covers(place: usize, shift: f64, length: usize) -> bool {
+    // Half a pixel beyond the last centre a pixel still has light on it.
+    (-0.5..=length as f64 - 0.5).contains(&(place as f64 - shift))
+}
+
+/// The coefficients that contribute to a place, and their weights.
+struct Taps {
+    places: [usize; 4],
+    weights: [f32; 4],
+}
+
+impl Taps {
+    fn at(place: usize, shift: f64, length: usize) -> Self {
+        let is_known = covers(place, shift, length);
+        let place = place as f64 - shift;
+        let (first, t) = (place.floor() as i64 - 1, place - place.floor());
+        let s = 1.0 - t;
+        let weights = [
+            s.powi(3) / 6.0,
+            2.0 / 3.0 - t * t * (2.0 - t) / 2.0,
+            2.0 / 3.0 - s * s * (2.0 - s) / 2.0,
+            t.powi(3) / 6.0,
+        ];
+        let reflected = |index: i64| {
+            let last = length as i64 - 1;
+            let index = index.abs();
+            (if index > last { 2 * last - index } else { index }).clamp(0, last) as usize
+        };
+        Self {
+            places: [0, 1, 2, 3].map(|tap| reflected(first + tap)),
+            weights: weights.map(|weight| if is_known { weight as f32 } else { f32::NAN }),
+        }
+    }
+}
+
+/// Converts samples into coefficients of a cubic spline, in place (Unser 1999).
+fn filter(mut line: ArrayViewMut1<'_, f32>) {
+    let length = line.len();
+    if length < 2 {
+        return;
+    }
+    let pole = 3.0f64.sqrt() - 2.0;
+    let mut values: Vec<f64> = line.iter().map(|&value| 6.0 * f64::from(value)).collect();
+    // Beyond 30 samples the powers of the pole are below 1e-17.
+    let (mut sum, mut power) = (0.0, 1.0);
+    for index in 0..30 {
+        let period = 2 * (length - 1);
+        let place = index % period;
+        sum += power * values[if place < length { place } else { period - place }];
+        power *= pole;
+    }
+    values[0] = sum;
+    for index in 1..length {
+        values[index] += pole * values[index - 1];
+    }
+    let last = length - 1;
+    values[last] = pole / (pole * pole - 1.0) * (values[last] + pole * values[last - 1]);
+    for index in (0..last).rev() {
+        values[index] = pole * (values[index + 1] - values[index]);
+    }
+    line.iter_mut().zip(values).for_each(|(out, value)| *out = value as f32);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{MARGIN, Registration, Splines, choose, register};
+    use ndarray::{Array3, ArrayView3, Axis, s};
+    use optics::{iid_masks, measure, noisy};
+
+    /// Masks \[B,n,n\] of a finer pattern, as areas of its pixels, moved by `cells` quarters of a pixel.
+    fn by_areas(frames: usize, side: usize, cells: [usize; 2]) -> Array3<f32> {
+        let fine = iid_masks(frames, side + 8, side + 8, 3).unwrap();
+        Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
+            let area = (0..16).map(|cell| {
+                let row = 4 * i + 16 + cell / 4 - cells[0];
+                let column = 4 * j + 16 + cell % 4 - cells[1];
+                fine[[k, row / 4, column / 4]]
+            });
+            area.sum::<f32>() / 16.0
+        })
+    }
+
+    fn scene(frames: usize, side: usize) -> Array3<f32> {
+        Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
+            let (i, j) = (i as f32, j as f32 - 1.5 * k as f32);
+            let disc = (i - 60.0).hypot(j - 60.0) < 25.0;
+            0.4 + 0.25 * (i / 9.0).sin() * (j / 13.0).cos() + if disc { 0.3 } else { 0.0 }
+        })
+    }
+
+    fn registered(
+        calibrated: &Array3<f32>,
+        moved: ArrayView3<'_, f32>,
+        sigma: f32,
+    ) -> Registration {
+        let (frames, side, _) = moved.dim();
+        let y = measure(moved, scene(frames, side).view()).unwrap();
+        let y = noisy(y, sigma, 7).unwrap();
+        let light = calibrated.sum_axis(Axis(0));
+        let (rows, columns) = choose(light.view(), y.view()).unwrap();
+        let masks = calibrated.slice(s![.., rows.clone(), columns.clone()]);
+        register(masks, y.slice(s![rows, columns]), &mut |_| true).unwrap().unwrap()
+    }
+
+    #[test]
+    fn moved_masks_are_found_and_masks_that_fit_are_left() {
+        let side = 2 * MARGIN + 64;
+        let calibrated = by_areas(6, side, [0, 0]);
+        for (cells, sigma) in [([2, 1], 0.0), ([10, 3], 0.01)] {
+            let moved = by_areas(6, side, cells);
+            let expected = cells.map(|cell| cell as f64 / 4.0);
+            let found = registered(&calibrated, moved.view(), sigma);
+            println!("{cells:?} {found:?}");
+            assert!(found.applied && found.error_after < found.error_before, "{found:?}");
+            for axis in 0..2 {
+                assert!((found.shift[axis] - expected[axis]).abs() < 0.1, "{cells:?} {found:?}");
+            }
+        }
+        for sigma in [0.0, 0.02] {
+            let found = registered(&calibrated, calibrated.view(), sigma);
+            println!("{found:?}");
+            assert!(!found.applied, "{found:?}");
+        }
+    }
+
+    #[test]
+    fn splines_pass_through_the_masks_and_a_window_needs_only_its_margin() {
+        let masks = iid_masks(2, 80, 90, 4).unwrap();
+        let whole = Splines::new(masks.view());
+        let unmoved = whole.window([0.0; 2], 0..80, 0..90);
+        assert!(unmoved.iter().zip(&masks).all(|(one, other)| (one - other).abs() < 1e-5));
+        let shift = [1.3, -2.6];
+        let expected = whole.window(shift, 30..50, 30..60);
+        let piece = masks.slice(s![.., 30 - MARGIN..50 + MARGIN, 30 - MARGIN..60 + MARGIN]);
+        let found = Splines::new(piece).window(shift, MARGIN..MARGIN + 20, MARGIN..MARGIN + 30);
+        assert!(found.iter().zip(&expected).all(|(one, other)| (one - other).abs() < 1e-5));
+        let moved = whole.window([3.0, 0.0], 0..80, 0..90);
+        assert!(moved.slice(s![.., ..2, ..]).iter().all(|value| value.is_nan()));
+        let (moved, masks) = (moved.slice(s![.., 3.., ..]), masks.slice(s![.., ..77, ..]));
+        assert!(moved.iter().zip(masks).all(|(one, other)| (one - other).abs() < 1e-5));
+    }
+}
