@@ -10,7 +10,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use super::CliError;
 use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
-use engine::job::{Algorithm, InvalidField, Mosaic, Sequence};
+use engine::job::{Algorithm, InvalidField, Mosaic, RegistrationRequest, Sequence};
 use engine::pipeline::NetworkSource;
 use formats::{Axes, Packing};
 use reconstruction::priors::onnx::Device;
@@ -79,6 +79,21 @@ impl ScheduleArguments {
             None => schedule,
         })
     }
+}
+
+/// A registration: `off`, `auto`, or a shift `ROWS,COLUMNS` in pixels.
+pub(super) fn registration(text: &str) -> Result<RegistrationRequest, String> {
+    let wrong = || format!("{text:?}; give off, auto, or ROWS,COLUMNS in pixels, such as 0.5,-1.2");
+    let request = match text {
+        "off" => return Ok(RegistrationRequest::Off),
+        "auto" => return Ok(RegistrationRequest::Auto),
+        shift => {
+            let (rows, columns) = shift.split_once(',').ok_or_else(wrong)?;
+            let pixels = |text: &str| text.trim().parse::<f64>().map_err(|_| wrong());
+            RegistrationRequest::Shift([pixels(rows)?, pixels(columns)?])
+        }
+    };
+    request.error(false).map_or(Ok(request), |error| Err(error.detail))
 }
 
 /// A selection of snapshots: `all`, one index, or `FIRST-LAST` including both ends.

@@ -18,8 +18,8 @@ use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Finding, FindingCode, InvalidField, JobId, JobRequest,
-    JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule,
-    Sequence, SnapshotRange, TileSpec, Timestamp, priority_error,
+    JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Registered, RegistrationRequest, Role,
+    RunSpec, SceneShape, Schedule, Sequence, SnapshotRange, TileSpec, Timestamp, priority_error,
 };
 use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
@@ -48,8 +48,11 @@ pub(super) struct JobBody {
     model: Option<ModelId>,
     schedule: Schedule,
     tile: TileSpec,
+    registration: RegistrationRequest,
+    /// The outcome of the registration; null before it, and if it is off.
+    registered: Option<Registered>,
     priority: i32,
-    /// Findings of the check of the measurement, and `bad_calibration`.
+    /// Findings of the check of the measurement, `bad_calibration`, and `moved_masks`.
     warnings: Vec<Finding>,
     /// The failure in words.
     error: Option<String>,
@@ -128,6 +131,8 @@ impl JobBody {
             model: spec.model.map(|model| model.id),
             schedule: spec.schedule,
             tile: spec.tile,
+            registration: spec.registration,
+            registered: spec.registered,
             priority: spec.priority,
             warnings: spec.warnings,
             error: job.error,

@@ -73,6 +73,7 @@ pub enum FindingCode {
     Mosaic,
     ShiftedMasks,
     DriftedMasks,
+    MovedMasks,
     TurnedMasks,
     ForeignMasks,
     FastMotion,
@@ -343,7 +344,15 @@ impl FindingCode {
                 Warning,
                 Warning,
                 "the masks are displaced by a fraction of a pixel",
-                "calibrate again once the optics are stable; if the finding stays, record dark frames and name them as `dark`",
+                "calibrate again once the optics are stable, or submit the job with `registration` auto; if the finding \
+                 stays, record dark frames and name them as `dark`",
+            ),
+            Self::MovedMasks => (
+                &[Job],
+                Warning,
+                Warning,
+                "the masks have moved since the calibration; the job has corrected them",
+                "calibrate again once the optics are stable",
             ),
             Self::TurnedMasks => (
                 &[Measurement],

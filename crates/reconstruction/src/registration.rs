@@ -44,7 +44,7 @@ pub struct Registration {
     pub uncertainty: [f64; 2],
     /// `||y - Hv||^2 / ||y||^2` at hold-out pixels with the masks of the calibration.
     pub error_before: f64,
-    /// The same with the moved masks.
+    /// `||y - Hv||^2 / ||y||^2` with the moved masks.
     pub error_after: f64,
     /// True if the masks are corrected by this shift. False if the masks fit.
     pub applied: bool,

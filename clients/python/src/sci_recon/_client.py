@@ -102,6 +102,7 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
+        registration: str | Mapping[str, Sequence[float]] | None = None,
         priority: int = 0,
         label: str | None = None,
         key: str | None = None,
@@ -154,6 +155,7 @@ class Client:
             schedule=schedule,
             tile=tile,
             model=model,
+            registration=registration,
             priority=priority,
             label=label,
             key=key,
@@ -279,13 +281,15 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
+        registration: str | Mapping[str, Sequence[float]] | None = None,
         priority: int = 0,
         label: str | None = None,
         key: str | None = None,
     ) -> Job:
         """Submits a job without waiting for it.
 
-        `snapshots` is "all", an index from 0, or (first, last), both included. A repeated request with the same `key`
+        `snapshots` is "all", an index from 0, or (first, last), both included. `registration` "auto" corrects masks that
+        have moved since the calibration, {"shift": (rows, columns)} states the shift in pixels. A repeated request with the same `key`
         returns the job of the first one.
         """
         return Job(
@@ -300,6 +304,7 @@ class Client:
                 schedule=schedule,
                 tile=tile,
                 model=model,
+                registration=registration,
                 priority=priority,
                 label=label,
             ),

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
+use super::registration::{Registered, RegistrationRequest};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
@@ -120,6 +121,10 @@ pub struct JobRequest {
     /// The tiles; by default those of the algorithm, or the whole picture for a network of fixed size.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
+    /// `auto` estimates and corrects a displacement of the masks since the calibration, `{"shift": [rows, columns]}`
+    /// states it in pixels; by default `off`.
+    #[serde(default, skip_serializing_if = "RegistrationRequest::is_off")]
+    pub registration: RegistrationRequest,
     /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
     #[schemars(range(min = -100, max = 100))]
@@ -146,6 +151,11 @@ pub struct JobSpec {
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
+    #[serde(default)]
+    pub registration: RegistrationRequest,
+    /// The outcome of the registration; `None` before it, and if it is off.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub registered: Option<Registered>,
     pub priority: i32,
     pub label: Option<Label>,
     pub warnings: Vec<Finding>,
@@ -204,6 +214,7 @@ impl JobRequest {
             errors.push(InvalidField::new("/tile", error.to_string()));
             Cut { tile, run: RunSpec::ALONE }
         });
+        errors.extend(self.registration.error(shape.mosaic.is_some()));
         errors.extend(priority_error(self.priority));
         if !errors.is_empty() {
             return Err(errors);
@@ -221,6 +232,8 @@ impl JobRequest {
             model,
             schedule,
             tile,
+            registration: self.registration,
+            registered: None,
             priority,
             label,
             warnings: Vec::new(),
