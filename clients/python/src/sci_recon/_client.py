@@ -289,8 +289,8 @@ class Client:
         """Submits a job without waiting for it.
 
         `snapshots` is "all", an index from 0, or (first, last), both included. `registration` "auto" corrects masks that
-        have moved since the calibration, {"shift": (rows, columns)} states the shift in pixels. A repeated request with the same `key`
-        returns the job of the first one.
+        have moved since the calibration, {"shift": (rows, columns)} states the shift in pixels. A repeated request with the
+        same `key` returns the job of the first one.
         """
         return Job(
             self,

@@ -157,7 +157,7 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
         bad_pixels=options.pop("bad_pixels", None),
         **{keyword: options.pop(option, None) for option, keyword in mask_options.items()},
     )
-    job_options = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "label"}
+    job_options = {"algorithm", "snapshots", "schedule", "tile", "model", "registration", "priority", "label"}
     job = {name: value for name, value in options.items() if name in job_options}
     measurement = {name: value for name, value in options.items() if name not in job_options}
 
