@@ -32,6 +32,9 @@ const ITERATIONS: (usize, usize) = (8, 24);
 const STEPS: [f64; 4] = [0.5, 0.25, 0.125, 0.125];
 /// Smallest t-statistic of an accepted correction.
 const SIGNIFICANT: f64 = 3.0;
+/// Smallest mean square of the interpolated masks at a pixel. Below it, ripples of the spline would be inverted, so the
+/// pixel counts as dark.
+const MIN_ENERGY: f32 = 1e-3;
 /// Smallest correction in pixels; a smaller one changes nothing that can be seen.
 const SMALLEST: f64 = 0.03;
 
@@ -325,6 +328,11 @@ impl Splines {
                     let value: f32 = places.map(|(&place, &weight)| weight * line[place]).sum();
                     *out = value.clamp(0.0, 1.0);
                 }
+            }
+        }
+        for mut pixel in window.lanes_mut(Axis(0)) {
+            if pixel.iter().map(|mask| mask * mask).sum::<f32>() < MIN_ENERGY * frames as f32 {
+                pixel.fill(0.0);
             }
         }
         window
