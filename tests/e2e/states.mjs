@@ -18,7 +18,7 @@ export async function faults(browser, checks, program, services) {
   const page = await checks.page(await browser.newContext(DESKTOP));
   await page.goto(`${service.url}/#/jobs/${bad.id}`);
   await page.waitForSelector(".judgement.bad, .judgement.usable");
-  checks.that(/Unreliable|caution/.test(await page.textContent(".judgement")), "the verdict warns");
+  checks.that(/Bad|Doubtful/.test(await page.textContent(".judgement")), "the verdict warns");
   checks.that((await page.textContent(".findings")).includes("What to do:"), "a finding shows its remedy");
   await page.waitForSelector("text=10 times slower than real time");
   await page.click("text=True speed");

@@ -215,9 +215,10 @@ impl DataDir {
     }
 }
 
+/// True if a file was modified less than `age` ago, or ahead of the clock: a clock that was set back tells no age.
 fn is_young(file: &File, age: Duration) -> bool {
     let modified = file.metadata().and_then(|meta| meta.modified());
-    modified.is_ok_and(|at| SystemTime::now().duration_since(at).is_ok_and(|past| past < age))
+    modified.is_ok_and(|at| SystemTime::now().duration_since(at).map_or(true, |past| past < age))
 }
 
 /// Runs work on files, which blocks, where it may block.

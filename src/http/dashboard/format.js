@@ -36,12 +36,11 @@ const clock = new Intl.DateTimeFormat(undefined, { hour: "2-digit", minute: "2-d
 const day = new Intl.DateTimeFormat(undefined, { day: "numeric", month: "short" });
 const full = new Intl.DateTimeFormat(undefined, { dateStyle: "medium", timeStyle: "medium" });
 
-/** Time of day, with the date if it is not today. */
+/** Date and time of day. */
 export function moment(text) {
   if (!text) return "–";
   const when = new Date(text);
-  const today = new Date().toDateString() === when.toDateString();
-  return today ? clock.format(when) : `${day.format(when)} ${clock.format(when)}`;
+  return `${day.format(when)} ${clock.format(when)}`;
 }
 
 /** Full date and time. */
@@ -113,7 +112,7 @@ export function iterationsOf(schedule) {
 export function verdictOf(job) {
   if (job.warnings.some((item) => item.severity === "error")) return ["bad", "bad"];
   if (job.warnings.length > 0 || job.assessment?.psnr_db === null) return ["usable", "doubtful"];
-  return job.assessment ? [job.assessment.grade, job.assessment.grade] : ["", "not judged"];
+  return job.assessment ? [job.assessment.grade, job.assessment.grade] : ["unknown", "not judged"];
 }
 
 /** Number and highest severity of a job's findings; null if there are none. */

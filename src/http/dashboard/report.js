@@ -13,7 +13,10 @@ export function findings(found) {
     item.remedy && h("p", null, h("b", null, "What to do: "), item.remedy))));
 }
 
-/** Grade of a calibration, loaded when the element becomes visible. */
+/** Milliseconds between requests for a grade that does not exist yet. */
+const AGAIN_MS = 1000;
+
+/** Grade of a calibration, loaded when the element becomes visible and the grade exists. */
 export function grade(id, signal) {
   const element = h("span", { class: "grade" }, " ");
   const ask = async () => {
@@ -22,7 +25,10 @@ export function grade(id, signal) {
       element.classList.add(found);
       put(element, found, reasons.length > 0 && h("span", { class: "muted" }, ` ${reasons.length} ${reasons.length === 1 ? "finding" : "findings"}`));
     } catch (error) {
-      if (!isAborted(error)) put(element, h("span", { class: "muted" }, error.code === "not_ready" ? "not graded yet" : "no grade"));
+      if (isAborted(error)) return;
+      const waits = error.code === "not_ready";
+      put(element, h("span", { class: "muted" }, waits ? "not graded yet" : "no grade"));
+      if (waits && element.isConnected) setTimeout(ask, AGAIN_MS);
     }
   };
   const watch = new IntersectionObserver((entries) => {

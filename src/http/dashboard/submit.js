@@ -95,7 +95,7 @@ function masks(settings, sensor, use, verdict, signal) {
     try {
       const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...stated }, signal);
       const again = (full_scale) => make(sha256, { ...stated, full_scale }).catch((later) => put(verdict, problem(later)));
-      put(verdict, accepted(item, signal), h("details", null, h("summary", null, `The stored number ${exact(item.full_scale)} means 1`), askScale(again, "Which stored number means 1, an open mask?")));
+      put(verdict, accepted(item, signal), h("details", null, h("summary", null, `Full scale of the masks: ${exact(item.full_scale)}`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
     } catch (error) {
       const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));

@@ -79,10 +79,10 @@ export class Verdict {
     const poor = this.graded === "usable" || this.graded === "bad";
     const errors = this.job.warnings.some((item) => item.severity === "error");
     const warned = this.job.warnings.length > 0;
-    if (errors) this.judge("Unreliable", "bad", "The checks found errors that make the frames wrong:");
-    else if (warned) this.judge("Use with caution", "usable", "The checks found problems that may degrade the frames:");
+    if (errors) this.judge("Bad", "bad", "The checks found errors that make the frames wrong:");
+    else if (warned) this.judge("Doubtful", "usable", "The checks found problems that may degrade the frames:");
     else if (this.assessment) this.judge(...EXPECTED[this.assessment.grade]);
-    else if (poor) this.judge("Use with caution", "usable", `The measurement fits its calibration, but the grade of the calibration is “${this.graded}”. Its report gives the reasons.`);
+    else if (poor) this.judge("Doubtful", "usable", `The measurement fits its calibration, but the grade of the calibration is “${this.graded}”. Its report gives the reasons.`);
     else this.judge("No problems found", "", "Measurement and calibration fit each other. This does not measure the quality of the frames. Attach true frames, if you have them, to measure it.");
   }
 

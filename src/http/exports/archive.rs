@@ -47,6 +47,14 @@ pub(super) async fn archive(clip: Clip, request: (&Method, &HeaderMap)) -> Resul
     composed.send(&app, job, request).await
 }
 
+/// `zarr_zip`: the OME-Zarr group as one file.
+pub(super) async fn zarr(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
+    let disposition = attachment(clip.job.id, clip.snapshot, "frames.zarr.zip");
+    let parts = parts(clip.zarr_files().await?);
+    let composed = Composed { parts, kind: "application/zip", disposition };
+    composed.send(&clip.app, clip.job, request).await
+}
+
 /// A file of the archive.
 #[derive(Debug, Clone)]
 struct Member {
@@ -57,7 +65,7 @@ struct Member {
 }
 
 /// The parts of an archive of these files.
-pub(super) fn parts(files: Vec<(String, Content)>) -> Vec<Part> {
+fn parts(files: Vec<(String, Content)>) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut members = Vec::new();
     let mut offset = 0;

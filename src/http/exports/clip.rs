@@ -15,7 +15,6 @@ use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Caller, Params, canonical_number};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, result_file};
-use super::archive;
 use super::composed::{Composed, Content, Part, Section, Source};
 use super::format::Format;
 use engine::job::JobId;
@@ -98,28 +97,6 @@ pub(super) async fn zarr(
     composed.send(&clip.app, clip.job, request).await
 }
 
-/// `zarr_zip`: the OME-Zarr group as one file.
-pub(super) async fn zarr_zip(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
-    let json = |value: Value| Content::Bytes(Bytes::from(value.to_string()));
-    let mut files = vec![
-        (GROUP.to_owned(), json(clip.zarr_group().await?)),
-        (ARRAY_METADATA.to_owned(), json(clip.zarr_array().await?)),
-    ];
-    let length = clip.frame_bytes();
-    for (index, source) in clip.sources().await?.into_iter().enumerate() {
-        let start = clip.start(&source)?;
-        for k in 0..clip.job.spec.shape.frames {
-            let frame = index * clip.job.spec.shape.frames + k;
-            let start = start + k as u64 * length;
-            let section = Section { source: source.clone(), start, length };
-            files.push((format!("0/c/{frame}{}", clip.chunk_suffix()), Content::File(section)));
-        }
-    }
-    let disposition = attachment(clip.job.id, clip.snapshot, "frames.zarr.zip");
-    let composed = Composed { parts: archive::parts(files), kind: "application/zip", disposition };
-    composed.send(&clip.app, clip.job, request).await
-}
-
 /// Times of the frames in seconds.
 struct Times {
     /// `None` if it is unknown, or not the same between all frames.
@@ -168,6 +145,26 @@ impl Clip {
     /// Offset of the frames in the file of a snapshot.
     fn start(&self, source: &Source) -> Result<u64> {
         values_offset(source, self.job.spec.shape.frames as u64 * self.frame_bytes())
+    }
+
+    /// All files of the OME-Zarr group, with their paths in it.
+    pub(super) async fn zarr_files(&self) -> Result<Vec<(String, Content)>> {
+        let json = |value: Value| Content::Bytes(Bytes::from(value.to_string()));
+        let mut files = vec![
+            (GROUP.to_owned(), json(self.zarr_group().await?)),
+            (ARRAY_METADATA.to_owned(), json(self.zarr_array().await?)),
+        ];
+        let (length, frames) = (self.frame_bytes(), self.job.spec.shape.frames);
+        for (index, source) in self.sources().await?.into_iter().enumerate() {
+            let start = self.start(&source)?;
+            for k in 0..frames {
+                let name = format!("0/c/{}{}", index * frames + k, self.chunk_suffix());
+                let start = start + k as u64 * length;
+                let section = Section { source: source.clone(), start, length };
+                files.push((name, Content::File(section)));
+            }
+        }
+        Ok(files)
     }
 
     /// The metadata of the OME-Zarr group (NGFF 0.5): axes, and seconds and pixels per step.

@@ -57,7 +57,7 @@ pub(super) async fn file(
         (Format::Npy, Some(_)) => stored(&clip, "frames.npy", request).await,
         (Format::Npy, None) => clip::array(clip, request).await,
         (Format::Tiff, _) => clip::tiff(clip, request).await,
-        (Format::ZarrZip, _) => clip::zarr_zip(clip, request).await,
+        (Format::ZarrZip, _) => archive::zarr(clip, request).await,
         (Format::Mp4, _) => movie::movie(clip, MovieFormat::Mp4, request).await,
         (Format::Gif, _) => movie::movie(clip, MovieFormat::Gif, request).await,
         (Format::Mosaic, Some(_)) if clip.job.spec.shape.mosaic.is_none() => {

@@ -65,7 +65,7 @@ pub(in crate::http) async fn create(
         return Err(ApiError::field("/snapshot", format!("the job has no snapshot {missing}")));
     }
     let base = snapshot.map_or(String::new(), |snapshot| format!("/snapshots/{snapshot}"));
-    let address = format!("/v1/jobs/{id}{base}/exports/{}", extension(format));
+    let address = format!("/v1/jobs/{id}{base}/exports/{}", format.into_str());
     let clip = Clip { app, job, snapshot, format: format.into() };
     check(&clip, format).await?;
     let window = requested_window(&clip.app, id, black, white).await?;
@@ -94,7 +94,7 @@ pub(super) async fn movie(
                 Err(StoreError::Damaged { .. }) => return Err(missing(format)),
                 file => file?,
             };
-            let name = format!("movie.{}", extension(format));
+            let name = format!("movie.{}", format.into_str());
             let kind = media_type(&name);
             let name = file_name(clip.job.id, clip.snapshot, &name);
             let disposition = format!("inline; {name}");
@@ -156,17 +156,9 @@ fn missing(format: MovieFormat) -> ApiError {
     let detail = format!(
         "there is no movie yet: to create it, POST {{\"format\": \"{}\"}} to exports of the job, with the snapshot \
          if the movie is of one",
-        extension(format)
+        format.into_str()
     );
     ApiError::new(Code::NotFound, detail)
-}
-
-/// The name of the format in paths, and the extension of its files.
-fn extension(format: MovieFormat) -> &'static str {
-    match format {
-        MovieFormat::Mp4 => "mp4",
-        MovieFormat::Gif => "gif",
-    }
 }
 
 fn failed(reason: &str) -> ApiError {
