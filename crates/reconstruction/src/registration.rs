@@ -8,7 +8,7 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut1, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis, s};
 use rand::{Rng, SeedableRng};
 
 use super::crop;
@@ -20,7 +20,7 @@ use super::solver;
 
 /// Largest displacement along each axis that is searched, in pixels.
 pub const REACH: usize = 4;
-/// Pixels around a window that its interpolation needs: the spline's filter falls below 1e-7 within 12 pixels.
+/// Pixels around a window that its interpolation needs: a spline's filter falls below 1e-7 within 12 pixels.
 pub const MARGIN: usize = 12 + REACH + 1;
 /// Shortest side in pixels of a piece that is compared.
 const SHORTEST_SIDE: usize = 32;
@@ -28,13 +28,22 @@ const SHORTEST_SIDE: usize = 32;
 const SHARE: f64 = 0.1;
 /// Iterations of total variation in the search by whole pixels, and in the refinement.
 const ITERATIONS: (usize, usize) = (8, 24);
-/// Distances in pixels between the displacements of the refinement.
-const STEPS: [f64; 4] = [0.5, 0.25, 0.125, 0.125];
+/// Distances in pixels between the displacements of the first grids of the refinement.
+const STEPS: [f64; 2] = [0.5, 0.25];
+/// Distance in pixels between the displacements of the last grids, and their largest number.
+const FINEST: (f64, usize) = (0.125, 5);
+/// Largest move of the last grid, in distances of its displacements. A longer one means that the search has not converged.
+const SETTLED: f64 = 0.5;
 /// Smallest t-statistic of an accepted correction.
 const SIGNIFICANT: f64 = 3.0;
-/// Smallest mean square of the interpolated masks at a pixel. Below it, ripples of the spline would be inverted, so the
-/// pixel counts as dark.
-const MIN_ENERGY: f32 = 1e-3;
+/// Smallest `sum C^2` of interpolated masks at a pixel, relative to the largest of the calibrated pixels around it. At darker
+/// pixels the errors of the interpolation outweigh the light, and the projection would divide by it.
+const MIN_ENERGY: f32 = 0.05;
+/// Width in pixels of the border of a defect that is filled from its surroundings.
+const FILLED: usize = 3;
+/// Distance from 0 and 1 of an intermediate value of a mask, and the largest share of such values in binary masks.
+const INTERMEDIATE: f32 = 0.1;
+const MAX_INTERMEDIATE: f64 = 0.02;
 /// Smallest correction in pixels; a smaller one changes nothing that can be seen.
 const SMALLEST: f64 = 0.03;
 
@@ -49,8 +58,10 @@ pub struct Registration {
     pub error_before: f64,
     /// `||y - Hv||^2 / ||y||^2` with the moved masks.
     pub error_after: f64,
-    /// True if the masks are corrected by this shift. False if the masks fit.
+    /// True if the masks are corrected by this shift. False if the masks fit, or if the search has not converged.
     pub applied: bool,
+    /// True if the search has converged within its reach.
+    pub converged: bool,
 }
 
 /// The rows and columns of the piece on which masks are registered, in a measurement `y` \[H,W\] behind masks with the sum
@@ -70,7 +81,7 @@ pub fn choose(
 
 /// Estimates the displacement from a piece of the masks \[B,h,w\] and of a measurement \[h,w\] on the scale on which the
 /// scene is on \[0,1\]; see [`choose`]. NaN were not measured. `proceed` gets the finished share, and returns false to stop.
-/// `None` if no light reaches the piece.
+/// `None` if the piece has no light or no measured pixels, or if its reconstruction diverges.
 ///
 /// # Errors
 /// Sizes that disagree or are too small, [`ReconError::Cancelled`], or those of [`solver::reconstruct`].
@@ -88,21 +99,28 @@ pub fn register(
         });
     }
     let inner = s![MARGIN..height - MARGIN, MARGIN..width - MARGIN];
+    let interpolated = Interpolated::new(masks);
     let masks = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
     let y = y.slice(inner).insert_axis(Axis(0)).to_owned();
-    let draws = [draw(&y, 0), draw(&y, 1)];
+    let draws = draw(&y);
     if draws.iter().any(|draw| draw.pixels.is_empty()) {
         return Ok(None);
     }
-    let splines = Splines::new(masks.view());
-    let total =
-        ((2 * REACH + 1).pow(2) * ITERATIONS.0 + (STEPS.len() * 9 + 2) * ITERATIONS.1) as f64;
-    let mut search = Search { masks, splines, y, proceed, done: 0.0, total };
+    let grids = STEPS.len() + FINEST.1;
+    let total = ((2 * REACH + 1).pow(2) * ITERATIONS.0 + (grids * 9 + 2) * ITERATIONS.1) as f64;
+    let mut search = Search { masks, interpolated, y, proceed, done: 0.0, total };
     let Some(mut best) = search.whole_pixels(&draws[0])? else { return Ok(None) };
-    let mut uncertainty = [0.0; 2];
     for step in STEPS {
         let Some(fit) = search.refine(best, step, &draws[0])? else { return Ok(None) };
-        (best, uncertainty) = (fit.minimum, fit.uncertainty);
+        best = fit.minimum;
+    }
+    let (mut uncertainty, mut has_settled) = ([0.0; 2], false);
+    for _ in 0..FINEST.1 {
+        let Some(fit) = search.refine(best, FINEST.0, &draws[0])? else { return Ok(None) };
+        (best, uncertainty, has_settled) = (fit.minimum, fit.uncertainty, fit.has_settled);
+        if has_settled {
+            break;
+        }
     }
     // The other draw took no part in the search, so its errors are not biased by it.
     let (before, after) = (
@@ -112,27 +130,34 @@ pub fn register(
     let (Some(before), Some(after)) = (before, after) else { return Ok(None) };
     let norm = draws[1].norm(search.y.view());
     let length = best[0].hypot(best[1]);
-    let within = best.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
+    let converged = has_settled && best.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
     Ok(Some(Registration {
         shift: best,
         uncertainty,
         error_before: before.iter().sum::<f64>() / norm,
         error_after: after.iter().sum::<f64>() / norm,
-        applied: within && length >= SMALLEST && t_statistic(&before, &after) >= SIGNIFICANT,
+        applied: converged && length >= SMALLEST && t_statistic(&before, &after) >= SIGNIFICANT,
+        converged,
     }))
 }
 
-/// Hold-out pixels of the draw `index` in a measurement \[1,h,w\].
-fn draw(y: &Array3<f32>, index: u64) -> HoldOut {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(index);
-    let drawn = y.indexed_iter().filter(|(_, value)| random.random_bool(SHARE) && !value.is_nan());
-    HoldOut { pixels: drawn.map(|(pixel, _)| pixel).collect() }
+/// Draws two sets of hold-out pixels of a measurement \[1,h,w\]. No pixel is in both.
+fn draw(y: &Array3<f32>) -> [HoldOut; 2] {
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(0);
+    let mut draws = [Vec::new(), Vec::new()];
+    for (pixel, value) in y.indexed_iter() {
+        let draw = (random.random::<f64>() / SHARE) as usize;
+        if let (Some(pixels), false) = (draws.get_mut(draw), value.is_nan()) {
+            pixels.push(pixel);
+        }
+    }
+    draws.map(|pixels| HoldOut { pixels })
 }
 
 struct Search<'a> {
     /// Masks \[B,h,w\] of the piece with its margin.
     masks: Array3<f32>,
-    splines: Splines,
+    interpolated: Interpolated,
     /// Measurement \[1,h,w\] of the piece without its margin.
     y: Array3<f32>,
     proceed: &'a mut dyn FnMut(f64) -> bool,
@@ -145,6 +170,8 @@ struct Search<'a> {
 struct Fit {
     minimum: [f64; 2],
     uncertainty: [f64; 2],
+    /// True if the quadratic has a minimum, close to the centre of the grid.
+    has_settled: bool,
 }
 
 impl Search<'_> {
@@ -167,7 +194,7 @@ impl Search<'_> {
             let (row, column) = (start(0), start(1));
             self.masks.slice(s![.., row..row + rows, column..column + columns]).to_owned()
         } else {
-            self.splines.window(shift, inner.0, inner.1)
+            self.interpolated.window(shift, inner.0, inner.1)
         };
         let whole = match SensingOperator::new(masks) {
             Err(ReconError::DarkMasks { .. }) => return Ok(None),
@@ -213,7 +240,9 @@ impl Search<'_> {
         }
         let sums: Vec<f64> = grid.iter().map(|errors| errors.iter().sum()).collect();
         let quadratic = Quadratic::fit(|place| sums[place]);
-        let offset = quadratic.minimum().unwrap_or_else(|| {
+        let lowest = quadratic.minimum();
+        let has_settled = lowest.is_some_and(|offset| offset.iter().all(|at| at.abs() <= SETTLED));
+        let offset = lowest.unwrap_or_else(|| {
             let smallest = (0..9).min_by(|a, b| sums[*a].total_cmp(&sums[*b])).unwrap_or(4);
             [smallest as f64 / 3.0, smallest as f64 % 3.0].map(|place| place.floor() - 1.0)
         });
@@ -223,7 +252,7 @@ impl Search<'_> {
         });
         let uncertainty = quadratic.uncertainty(gradients).map(|value| value * step);
         let minimum = [centre[0] + step * offset[0], centre[1] + step * offset[1]];
-        Ok(Some(Fit { minimum, uncertainty }))
+        Ok(Some(Fit { minimum, uncertainty, has_settled }))
     }
 }
 
@@ -284,24 +313,41 @@ impl Quadratic {
     }
 }
 
-/// Cubic splines through masks \[B,h,w\].
-pub struct Splines {
-    /// Coefficients \[B,h,w\].
-    coefficients: Array3<f32>,
+/// How masks are interpolated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Kernel {
+    /// Linear, for binary masks: a moved pixel then covers parts of its neighbours in proportion to their areas.
+    Area,
+    /// Cubic splines, for masks with intermediate values, which optics have blurred.
+    Spline,
 }
 
-impl Splines {
-    /// Splines that continue the masks by reflection. NaN count as 0.
+/// Interpolated masks \[B,h,w\].
+pub struct Interpolated {
+    kernel: Kernel,
+    /// The masks, or coefficients of splines through them \[B,h,w\].
+    coefficients: Array3<f32>,
+    /// `sum C^2` of the masks \[h,w\]; NaN where they are unknown.
+    energy: Array2<f32>,
+}
+
+impl Interpolated {
+    /// Continues the masks by reflection. NaN are filled from their surroundings, so that they do not ring.
     pub fn new(masks: ArrayView3<'_, f32>) -> Self {
-        let mut coefficients = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
-        for axis in [Axis(1), Axis(2)] {
-            coefficients.lanes_mut(axis).into_iter().for_each(filter);
+        let energy = masks.map_axis(Axis(0), |pixel| pixel.iter().map(|mask| mask * mask).sum());
+        let mut coefficients = masks.to_owned();
+        coefficients.outer_iter_mut().for_each(fill);
+        let kernel = if is_binary(masks) { Kernel::Area } else { Kernel::Spline };
+        if kernel == Kernel::Spline {
+            for axis in [Axis(1), Axis(2)] {
+                coefficients.lanes_mut(axis).into_iter().for_each(filter);
+            }
         }
-        Self { coefficients }
+        Self { kernel, coefficients, energy }
     }
 
     /// A window of the masks after they moved down and to the right by `shift`, clipped to \[0,1\]. A pixel that no part of
-    /// the masks has moved onto is NaN.
+    /// the masks has moved onto is NaN. All masks are 0 where an unknown pixel contributes or hardly any light is left.
     pub fn window(
         &self,
         shift: [f64; 2],
@@ -310,7 +356,7 @@ impl Splines {
     ) -> Array3<f32> {
         let (frames, height, width) = self.coefficients.dim();
         let taps = |range: Range<usize>, shift: f64, length: usize| -> Vec<Taps> {
-            range.map(|place| Taps::at(place, shift, length)).collect()
+            range.map(|place| Taps::at(place, shift, length, self.kernel)).collect()
         };
         let (rows, columns) = (taps(rows, shift[0], height), taps(columns, shift[1], width));
         let mut window = Array3::zeros((frames, rows.len(), columns.len()));
@@ -330,13 +376,54 @@ impl Splines {
                 }
             }
         }
-        for mut pixel in window.lanes_mut(Axis(0)) {
-            if pixel.iter().map(|mask| mask * mask).sum::<f32>() < MIN_ENERGY * frames as f32 {
+        let places = rows.iter().flat_map(|row| columns.iter().map(move |column| (row, column)));
+        for (mut pixel, (row, column)) in window.lanes_mut(Axis(0)).into_iter().zip(places) {
+            let nearest = row.nearest().iter().flat_map(|&row| {
+                column.nearest().iter().map(move |&column| self.energy[[row, column]])
+            });
+            // NaN outweigh all other values.
+            let brightest: f32 =
+                nearest.fold(
+                    0.0,
+                    |most, energy| if energy > most || energy.is_nan() { energy } else { most },
+                );
+            let energy = pixel.iter().map(|mask| mask * mask).sum::<f32>();
+            if brightest.is_nan() && !energy.is_nan() || energy < MIN_ENERGY * brightest {
                 pixel.fill(0.0);
             }
         }
         window
     }
+}
+
+/// True if nearly all known values are close to 0 or 1.
+fn is_binary(masks: ArrayView3<'_, f32>) -> bool {
+    let (mut known, mut between) = (0, 0);
+    for &value in masks.iter().filter(|value| !value.is_nan()) {
+        known += 1;
+        between += usize::from(value > INTERMEDIATE && value < 1.0 - INTERMEDIATE);
+    }
+    f64::from(between as u32) <= MAX_INTERMEDIATE * f64::from(known as u32)
+}
+
+/// Replaces NaN of a mask within [`FILLED`] pixels of known ones by means of their neighbours, and others by 0.
+fn fill(mut mask: ArrayViewMut2<'_, f32>) {
+    let mut unknown: Vec<(usize, usize)> =
+        mask.indexed_iter().filter(|(_, value)| value.is_nan()).map(|(at, _)| at).collect();
+    let (height, width) = mask.dim();
+    for _ in 0..FILLED {
+        let means = unknown.iter().map(|&(row, column)| {
+            let rows = row.saturating_sub(1)..height.min(row + 2);
+            let columns = column.saturating_sub(1)..width.min(column + 2);
+            let around = mask.slice(s![rows, columns]);
+            let known = || around.iter().filter(|value| !value.is_nan());
+            known().sum::<f32>() / known().count() as f32
+        });
+        let means: Vec<f32> = means.collect();
+        unknown.iter().zip(&means).for_each(|(&at, &mean)| mask[at] = mean);
+        unknown.retain(|&at| mask[at].is_nan());
+    }
+    unknown.into_iter().for_each(|at| mask[at] = 0.0);
 }
 
 /// True if part of masks of this length, moved by `shift`, lies on the pixel `place`.
@@ -349,20 +436,29 @@ pub fn covers(place: usize, shift: f64, length: usize) -> bool {
 struct Taps {
     places: [usize; 4],
     weights: [f32; 4],
+    is_between: bool,
 }
 
 impl Taps {
-    fn at(place: usize, shift: f64, length: usize) -> Self {
+    /// The one or two nearest pixels.
+    fn nearest(&self) -> &[usize] {
+        if self.is_between { &self.places[1..3] } else { &self.places[1..2] }
+    }
+
+    fn at(place: usize, shift: f64, length: usize, kernel: Kernel) -> Self {
         let is_known = covers(place, shift, length);
         let place = place as f64 - shift;
         let (first, t) = (place.floor() as i64 - 1, place - place.floor());
         let s = 1.0 - t;
-        let weights = [
-            s.powi(3) / 6.0,
-            2.0 / 3.0 - t * t * (2.0 - t) / 2.0,
-            2.0 / 3.0 - s * s * (2.0 - s) / 2.0,
-            t.powi(3) / 6.0,
-        ];
+        let weights = match kernel {
+            Kernel::Area => [0.0, s, t, 0.0],
+            Kernel::Spline => [
+                s.powi(3) / 6.0,
+                2.0 / 3.0 - t * t * (2.0 - t) / 2.0,
+                2.0 / 3.0 - s * s * (2.0 - s) / 2.0,
+                t.powi(3) / 6.0,
+            ],
+        };
         let reflected = |index: i64| {
             let last = length as i64 - 1;
             let index = index.abs();
@@ -371,6 +467,7 @@ impl Taps {
         Self {
             places: [0, 1, 2, 3].map(|tap| reflected(first + tap)),
             weights: weights.map(|weight| if is_known { weight as f32 } else { f32::NAN }),
+            is_between: t > 0.0,
         }
     }
 }
@@ -405,7 +502,7 @@ fn filter(mut line: ArrayViewMut1<'_, f32>) {
 
 #[cfg(test)]
 mod tests {
-    use super::{MARGIN, Registration, Splines, choose, register};
+    use super::{Interpolated, MARGIN, Registration, choose, register};
     use ndarray::{Array3, ArrayView3, Axis, s};
     use optics::{iid_masks, measure, noisy};
 
@@ -466,15 +563,60 @@ mod tests {
     }
 
     #[test]
-    fn splines_pass_through_the_masks_and_a_window_needs_only_its_margin() {
-        let masks = iid_masks(2, 80, 90, 4).unwrap();
-        let whole = Splines::new(masks.view());
+    fn dark_and_unknown_pixels_count_as_not_measured() {
+        let mut masks = iid_masks(4, 60, 60, 4).unwrap();
+        let whole = Interpolated::new(masks.view());
+        masks.slice_mut(s![.., 30, 30]).fill(f32::NAN);
+        let shift = [0.4, 0.3];
+        let moved = Interpolated::new(masks.view()).window(shift, 20..40, 20..40);
+        assert!(moved.iter().all(|value| (0.0..=1.0).contains(value)));
+        let darkest = |masks: &Array3<f32>| {
+            let energies =
+                masks.map_axis(Axis(0), |pixel| pixel.iter().map(|c| c * c).sum::<f32>());
+            energies.into_iter().filter(|energy| *energy > 0.0).fold(4.0, f32::min)
+        };
+        assert!(darkest(&moved) >= super::MIN_ENERGY);
+        // The unknown pixel contributes to four pixels. The others hardly notice it.
+        let expected = whole.window(shift, 20..40, 20..40);
+        let differ = |bound: f32| {
+            let pixels = moved.lanes(Axis(0)).into_iter().zip(expected.lanes(Axis(0)));
+            pixels
+                .filter(|(one, other)| one.iter().zip(*other).any(|(a, b)| (a - b).abs() > bound))
+                .count()
+        };
+        assert!((0..4).all(|k| moved[[k, 10, 10]] == 0.0 && moved[[k, 11, 11]] == 0.0));
+        assert!((1..=4).contains(&differ(0.3)), "{}", differ(0.3));
+    }
+
+    #[test]
+    fn hold_out_pixels_of_the_two_draws_differ() {
+        let mut y = Array3::zeros((1, 60, 60));
+        y[[0, 3, 3]] = f32::NAN;
+        let [one, other] = super::draw(&y);
+        assert!(one.pixels.len() > 250 && other.pixels.len() > 250);
+        assert!(
+            one.pixels.iter().all(|pixel| !other.pixels.contains(pixel) && *pixel != (0, 3, 3))
+        );
+    }
+
+    #[test]
+    fn interpolation_passes_through_the_masks_and_a_window_needs_only_its_margin() {
+        let binary = iid_masks(2, 80, 90, 4).unwrap();
+        let grey = by_areas(2, 90, [1, 2]).slice_move(s![.., ..80, ..]);
+        for masks in [binary, grey] {
+            check_interpolation(&masks);
+        }
+    }
+
+    fn check_interpolation(masks: &Array3<f32>) {
+        let whole = Interpolated::new(masks.view());
         let unmoved = whole.window([0.0; 2], 0..80, 0..90);
-        assert!(unmoved.iter().zip(&masks).all(|(one, other)| (one - other).abs() < 1e-5));
+        assert!(unmoved.iter().zip(masks).all(|(one, other)| (one - other).abs() < 1e-5));
         let shift = [1.3, -2.6];
         let expected = whole.window(shift, 30..50, 30..60);
         let piece = masks.slice(s![.., 30 - MARGIN..50 + MARGIN, 30 - MARGIN..60 + MARGIN]);
-        let found = Splines::new(piece).window(shift, MARGIN..MARGIN + 20, MARGIN..MARGIN + 30);
+        let found =
+            Interpolated::new(piece).window(shift, MARGIN..MARGIN + 20, MARGIN..MARGIN + 30);
         assert!(found.iter().zip(&expected).all(|(one, other)| (one - other).abs() < 1e-5));
         let moved = whole.window([3.0, 0.0], 0..80, 0..90);
         assert!(moved.slice(s![.., ..2, ..]).iter().all(|value| value.is_nan()));

@@ -7,6 +7,10 @@ use super::report::{Finding, FindingCode};
 use super::text::InvalidField;
 use reconstruction::registration::{REACH, Registration};
 
+/// Reason where an estimate is not reliable.
+const NOT_CONVERGED: &str =
+    "the search for the shift has not converged within 4 pixels, so the masks were not moved";
+
 /// Correction of masks that have moved since their calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -56,9 +60,9 @@ pub struct Registered {
     pub error_before: Option<f64>,
     /// Relative squared error at these pixels with the moved masks; null for a stated shift.
     pub error_after: Option<f64>,
-    /// True if the job uses the moved masks. False if the calibrated masks fit.
+    /// True if the job uses the moved masks. False if the calibrated masks fit, or if there is a `reason`.
     pub applied: bool,
-    /// Why nothing was estimated; null if it was.
+    /// Why nothing was estimated, or why the estimate is unreliable; null otherwise.
     pub reason: Option<String>,
 }
 
@@ -106,14 +110,15 @@ impl Registered {
 
 impl From<Registration> for Registered {
     fn from(found: Registration) -> Self {
-        let Registration { shift, uncertainty, error_before, error_after, applied } = found;
+        let Registration { shift, uncertainty, error_before, error_after, applied, converged } =
+            found;
         Self {
             shift,
             uncertainty: Some(uncertainty),
             error_before: Some(error_before),
             error_after: Some(error_after),
             applied,
-            reason: None,
+            reason: (!converged).then(|| NOT_CONVERGED.to_owned()),
         }
     }
 }

@@ -12,7 +12,7 @@ use super::tile::TileInput;
 use crate::job::Sha256;
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
-use reconstruction::registration::{MARGIN, Splines, covers};
+use reconstruction::registration::{Interpolated, MARGIN, covers};
 use reconstruction::tile::Window;
 
 /// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], divided by their full scale.
@@ -105,7 +105,7 @@ pub fn mask_window(
     let inner = (within(&place.rows, rows.start), within(&place.columns, columns.start));
     let wide = Window { rows, columns, step: 1 };
     let moved =
-        Splines::new(window(masks, 0..frames, &wide)?.view()).window(shift, inner.0, inner.1);
+        Interpolated::new(window(masks, 0..frames, &wide)?.view()).window(shift, inner.0, inner.1);
     let step = place.step.cast_signed();
     Ok(moved.slice(s![.., ..;step, ..;step]).to_owned())
 }

@@ -2,7 +2,7 @@
 
 use ndarray::{Array3, ArrayView2, ArrayView3, s};
 
-use super::arrays::Arrays;
+use super::arrays::{Arrays, mask_window};
 use super::error::Result;
 use super::progress::Monitor;
 use crate::job::{Registered, RegistrationRequest, SnapshotRange, TaskStage};
@@ -12,7 +12,8 @@ use reconstruction::tile::Window;
 /// Reason for sensors with colours. The planes of a mosaic sample the masks at every second pixel only.
 const COLOUR: &str = "masks of colour sensors are not registered";
 const SMALL: &str = "the picture is too small to register the masks";
-const DARK: &str = "no light reaches the piece on which masks are registered";
+const DARK: &str = "the piece on which masks are registered has no light or no measured pixels, or its reconstruction \
+                    diverges";
 
 /// Registers masks in memory: all of them \[B,H,W\], and one snapshot \[H,W\] on the scale on which the scene is on
 /// \[0,1\]. `None` if it is off.
@@ -57,7 +58,7 @@ pub fn register_stored(
     let first = snapshots.first;
     let y = arrays.snapshot(first)? / white;
     let light = arrays.light(monitor)?;
-    let piece = |place: &Window| Ok(arrays.window(first..first + 1, place, white)?.masks);
+    let piece = |place: &Window| Ok(mask_window(&arrays.masks()?, place, None)?);
     register(request, is_mosaic, light.view(), y.view(), piece, &mut |share| {
         monitor.reach(TaskStage::Tv, share);
         !monitor.stopped()
@@ -67,5 +68,5 @@ pub fn register_stored(
 /// Masks \[B,H,W\] in memory after they moved by `shift`, with NaN where their value is unknown.
 pub fn moved(masks: ArrayView3<'_, f32>, shift: [f64; 2]) -> Array3<f32> {
     let (_, height, width) = masks.dim();
-    registration::Splines::new(masks).window(shift, 0..height, 0..width)
+    registration::Interpolated::new(masks).window(shift, 0..height, 0..width)
 }

@@ -156,15 +156,11 @@ impl Core {
             return Err(wrong().into());
         };
         let tile = tile_task(job, snapshot, tile)?;
-        // Windows of moved masks are known by their contents only.
-        let known = tile.shift.is_none().then(|| self.window(tile.masks, tile.tile)).flatten();
-        let masks = match known {
+        let masks = match self.window(&tile) {
             Some(known) if self.is_put(pool, known.sha256) => known,
             _ => {
                 let input = self.put_input(pool, self.cut(&tile, Part::Masks).await?).await?;
-                if tile.shift.is_none() {
-                    self.note_window(tile.masks, tile.tile, input);
-                }
+                self.note_window(&tile, input);
                 input
             }
         };
