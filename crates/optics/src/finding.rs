@@ -337,7 +337,8 @@ impl FindingCode {
                 Error,
                 "the masks fit better when shifted (by up to 32 pixels)",
                 "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
-                 calibration: calibrate again",
+                 calibration: calibrate again, or submit the job with `registration` auto if they moved by at most 4 \
+                 pixels",
             ),
             Self::DriftedMasks => (
                 &[Measurement],
