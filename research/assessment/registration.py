@@ -6,7 +6,7 @@
 DATA has photographs in photos/train and photos/val. A camera moves over them behind masks of four kinds, Cr 8 to 20, with
 noise of 0 to 10. Binary masks move as areas of a pattern with eight times the resolution, blurred or not. Masks of the
 optics move by the Fourier shift theorem. The program interpolates in other ways. Each case is reconstructed with the
-masks of the calibration, registered ones and the true ones, and once more without a drift. `run` appends a line to a
+masks of the calibration, registered ones and the true ones. Right masks and flipped ones must be left alone. `run` appends a line to a
 file in FOLDER for this binary: an interrupted run continues where it stopped. The last line of a report is JSON.
 """
 import argparse
@@ -110,6 +110,8 @@ class Bench:
             y = (true * case.frames).sum(0) + case.noise
             arms = [('calibrated', case.calibrated, 'off'), ('registered', case.calibrated, 'auto')]
             arms += [('true', true, 'off')] if drift == 'drift' else []
+            if drift == 'none':
+                arms += [('flipped', case.calibrated[:, :, ::-1], 'off'), ('flipped_registered', case.calibrated[:, :, ::-1], 'auto')]
             runs[drift] = {name: self.reconstruct(masks, y, case.frames, option) for name, masks, option in arms}
         with self.lock, open(self.path, 'a') as file:
             file.write(json.dumps({'case': index} | case.about() | runs) + '\n')
@@ -165,8 +167,9 @@ def summary(rows):
             'within_0_05': sum(error <= .05 for _, error in applied), 'within_0_1': sum(error <= .1 for _, error in applied),
             'calibrated_db': psnr('calibrated'), 'registered_db': psnr('registered'), 'true_db': psnr('true'),
             'lost_to_true_db': median([gain(row['drift'], 'true', 'registered') for row, _ in applied]),
-            'made_worse': sum(gain(row[drift]) < -WORSE for row in rows for drift in ('drift', 'none')),
-            'false_corrections': sum(row['none']['registered']['registration']['applied'] for row in rows)}
+            'made_worse': sum(gain(row[drift]) < -WORSE for row in rows for drift in ('drift', 'none'))
+                          + sum(gain(row['none'], 'flipped_registered', 'flipped') < -WORSE for row in rows),
+            'false_corrections': [sum(row['none'][arm]['registration']['applied'] for row in rows) for arm in ('registered', 'flipped_registered')]}
 
 
 def report(a):
@@ -180,13 +183,14 @@ def report(a):
             psnr = ' '.join(f'{row["drift"][name]["psnr_db"]:.2f}' for name in ('calibrated', 'registered', 'true'))
             print(f'{row["case"]:3} {row["kind"]:15} Cr {row["ratio"]:2} sigma {row["sigma"]:g} shift {row["shift"]} found {np.round(found["shift"], 3).tolist()} '
                   f'{"not applied" if off is None else f"off by {off:.3f}"}{"" if off is None or off <= limit(row) else " !"} dB {psnr} {(found["reason"] or "")[:40]}; '
-                  f'no drift: {np.round(still["shift"], 3).tolist()} {"APPLIED" if still["applied"] else "left"} {gain(row["none"]):+.2f} {(still["reason"] or "")[:40]}')
+                  f'no drift: {np.round(still["shift"], 3).tolist()} {"APPLIED" if still["applied"] else "left"} {gain(row["none"]):+.2f}; '
+                  f'flipped: {"APPLIED" if row["none"]["flipped_registered"]["registration"]["applied"] else "left"}')
         print()
-    print('| masks | corrected | within the limit | within 0.05 and 0.1 pixels | calibrated, registered, true masks, dB | below true masks, dB | false corrections | made worse |')
+    print('| masks | corrected | within the limit | within 0.05 and 0.1 pixels | calibrated, registered, true masks, dB | below true masks, dB | corrections of right masks, of flipped ones | made worse |')
     print('| --- | --- | --- | --- | --- | --- | --- | --- |')
     for kind, one in table.items():
         print(f'| {kind} | {one["applied"]} of {one["cases"]} | {one["within_limit"]} | {one["within_0_05"]}, {one["within_0_1"]} | {one["calibrated_db"]}, {one["registered_db"]}, {one["true_db"]}'
-              f' | {one["lost_to_true_db"]} | {one["false_corrections"]} | {one["made_worse"]} |')
+              f' | {one["lost_to_true_db"]} | {", ".join(map(str, one["false_corrections"]))} | {one["made_worse"]} |')
     cost = [row[drift]['registered']['cpu_s'] - row[drift]['calibrated']['cpu_s'] for row in rows for drift in ('drift', 'none')]
     per_frame = [seconds / row['ratio'] for seconds, row in zip(cost, [row for row in rows for _ in range(2)])]
     print()

@@ -353,7 +353,7 @@ class Bench:
                 np.save(folder / f'{name}.npy', array)
             command = [self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
                        '--truth-full-scale', '1', '--measurement-full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
-                       '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
+                       '--registration', 'off', '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
             done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             if done.returncode == 2:
                 return {'refused': done.stderr.strip()}

@@ -117,7 +117,7 @@ pub struct Arguments {
     truth_axes: Option<Axes>,
     /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
     /// it in pixels.
-    #[arg(long, value_name = "WHICH", default_value = "off", value_parser = registration, allow_hyphen_values = true)]
+    #[arg(long, value_name = "WHICH", default_value = "auto", value_parser = registration, allow_hyphen_values = true)]
     registration: RegistrationRequest,
     #[command(flatten)]
     schedule: ScheduleArguments,

@@ -107,7 +107,7 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "PIXELS", requires = "tile", help_heading = JOB)]
     overlap: Option<u32>,
     /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
-    /// it in pixels [default: off].
+    /// it in pixels [default: auto].
     #[arg(long, value_name = "WHICH", value_parser = registration, allow_hyphen_values = true, help_heading = JOB)]
     registration: Option<RegistrationRequest>,
     /// From -100 to 100; jobs of higher priority are served first.

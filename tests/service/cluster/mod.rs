@@ -149,7 +149,8 @@ async fn moved_masks_give_the_same_bytes_on_remote_workers() {
         (with_iterations(&measurement, 50), &unmoved),
     ] {
         let id = app.submit(&job).await;
-        assert_eq!(app.ended(&id).await["state"], "succeeded");
+        let ended = app.ended(&id).await;
+        assert_eq!(ended["state"], "succeeded", "{ended:#}");
         assert_eq!(results(&app, &id).await, *expected);
     }
 }

@@ -9,26 +9,31 @@ use reconstruction::registration::{REACH, Registration};
 
 /// Reason where an estimate is not reliable.
 const NOT_CONVERGED: &str =
-    "the search for the shift has not converged within 4 pixels, so the masks were not moved";
+    "no shift by at most 4 pixels makes the masks explain the measurement, so they were not moved";
 
 /// Correction of masks that have moved since their calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RegistrationRequest {
     /// Uses the masks as they were calibrated.
-    #[default]
     Off,
     /// Estimates the displacement from the first snapshot, and corrects the masks if that lowers the hold-out error
     /// significantly.
+    #[default]
     Auto,
     /// Moves the masks down and to the right by these pixels, at most 4 along each axis.
     Shift([f64; 2]),
 }
 
 impl RegistrationRequest {
-    /// True if the masks are used as they were calibrated.
-    pub fn is_off(&self) -> bool {
-        *self == Self::Off
+    /// The request of jobs that are older than the registration of masks.
+    pub(super) fn off() -> Self {
+        Self::Off
+    }
+
+    /// True for the default.
+    pub(super) fn is_auto(&self) -> bool {
+        *self == Self::Auto
     }
 
     /// The error of a stated shift that is out of range, or for a sensor with colours.

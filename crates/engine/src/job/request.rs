@@ -122,8 +122,8 @@ pub struct JobRequest {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
     /// `auto` estimates and corrects a displacement of the masks since the calibration, `{"shift": [rows, columns]}`
-    /// states it in pixels; by default `off`.
-    #[serde(default, skip_serializing_if = "RegistrationRequest::is_off")]
+    /// states it in pixels, and `off` uses the masks as they were calibrated; by default `auto`.
+    #[serde(default, skip_serializing_if = "RegistrationRequest::is_auto")]
     pub registration: RegistrationRequest,
     /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
@@ -151,7 +151,7 @@ pub struct JobSpec {
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
-    #[serde(default)]
+    #[serde(default = "RegistrationRequest::off")]
     pub registration: RegistrationRequest,
     /// The outcome of the registration; `None` before it, and if it is off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
