@@ -321,7 +321,7 @@ impl Quadratic {
     }
 }
 
-/// How masks are interpolated.
+/// Interpolation of masks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Kernel {
     /// Linear, for binary masks: a moved pixel then covers parts of its neighbours in proportion to their areas.

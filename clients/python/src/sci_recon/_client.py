@@ -290,7 +290,7 @@ class Client:
 
         `snapshots` is "all", an index from 0, or (first, last), both included. `registration` "auto", the default,
         corrects masks that have moved since the calibration; {"shift": (rows, columns)} states the shift in pixels, and
-        "off" uses the masks as they are. A repeated request with the same `key` returns the job of the first one.
+        "off" uses the calibrated masks. A repeated request with the same `key` returns the job of the first one.
         """
         return Job(
             self,
