@@ -427,7 +427,11 @@ impl<'a> Input<'a> {
         let (light, y) = (light.view(), y.view());
         let registered =
             registration::register(request, mosaic.is_some(), light, y, piece, &mut |_| true)?;
-        self.findings.extend(registered.as_ref().and_then(Registered::finding));
+        if let Some(registered) = &registered {
+            let superseded = registered.superseded();
+            self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
+            self.findings.extend(registered.finding());
+        }
         if let Some(shift) = registered.as_ref().and_then(Registered::applied_shift) {
             let moved = registration::moved(masks, shift);
             for mut snapshot in self.measurement.array.outer_iter_mut() {

@@ -72,7 +72,7 @@ async fn moved_masks_are_corrected_and_reported() {
     assert!(
         registered["error_after"].as_f64().unwrap() < registered["error_before"].as_f64().unwrap()
     );
-    // The check of the measurement sees the drift, but the frames of the corrected job are not doubted.
+    // The check of the measurement sees the drift, but the corrected job is not doubted.
     let seen = |job: &Value, list: &Value| {
         assert!(list.is_array(), "{job:#}");
         list.as_array().unwrap().iter().any(|finding| {
@@ -83,6 +83,7 @@ async fn moved_masks_are_corrected_and_reported() {
     };
     assert!(seen(&off, &off["assessment"]["reasons"]), "{off:#}");
     assert!(!seen(&auto, &auto["assessment"]["reasons"]), "{auto:#}");
+    assert!(seen(&off, &off["warnings"]) && !seen(&auto, &auto["warnings"]), "{auto:#}");
     let (_, stated) = run(&app, &moved, &json!({"shift": [1.5, 0.75]})).await;
     let quality = [&uncorrected, &corrected, &stated].map(|file| psnr(SCENE, 0, &values(file)));
     assert!(quality[1] > quality[0] + 3.0 && quality[2] > quality[0] + 3.0, "{quality:?}");

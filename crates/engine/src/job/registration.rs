@@ -8,8 +8,7 @@ use super::text::InvalidField;
 use reconstruction::registration::{REACH, Registration};
 
 /// Reason where an estimate is not reliable.
-const NOT_CONVERGED: &str =
-    "no shift by at most 4 pixels makes the masks explain the measurement, so they were not moved";
+const NOT_CONVERGED: &str = "no shift by at most 4 pixels makes the masks explain the measurement well enough, so they were not moved";
 
 /// Correction of masks that have moved since their calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -93,6 +92,19 @@ impl Registered {
     /// The shift that is applied to the masks.
     pub fn applied_shift(&self) -> Option<[f64; 2]> {
         self.applied.then_some(self.shift)
+    }
+
+    /// Findings of the measurement's check that do not apply to masks that the job has moved. If these still do not fit, the
+    /// frames do not explain the hold-out pixels.
+    pub fn superseded(&self) -> &'static [FindingCode] {
+        const DRIFT: [FindingCode; 3] =
+            [FindingCode::DriftedMasks, FindingCode::ShiftedMasks, FindingCode::ForeignMasks];
+        match (self.applied, self.error_after) {
+            (false, _) => &[],
+            (true, Some(_)) => &DRIFT,
+            // Nothing has tested a stated shift against masks of another camera.
+            (true, None) => &DRIFT[..2],
+        }
     }
 
     /// The finding on masks that have moved.

@@ -303,19 +303,9 @@ fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
 /// A part of the picture is reported if its PSNR is this much below that of the whole picture, in dB.
 const UNEVEN_DB: f64 = 4.0;
 
-/// The findings of the checks that apply to the frames. Masks that the job has moved no longer differ from the measurement by
-/// the drift that its check found. If they still do, the frames don't explain the hold-out pixels.
-fn applicable(warnings: &[Finding]) -> Vec<Finding> {
-    const DRIFT: [FindingCode; 3] =
-        [FindingCode::DriftedMasks, FindingCode::ForeignMasks, FindingCode::ShiftedMasks];
-    let are_moved = warnings.iter().any(|finding| finding.is(FindingCode::MovedMasks));
-    let applies = |finding: &&Finding| !(are_moved && DRIFT.iter().any(|code| finding.is(*code)));
-    warnings.iter().filter(applies).cloned().collect()
-}
-
 /// The findings of the checks, and the worst part of the picture. `peak` is the peak of the PSNR.
 fn reasons(error: &Array3<f32>, (psnr_db, peak): (f64, f64), warnings: &[Finding]) -> Vec<Finding> {
-    let mut reasons = applicable(warnings);
+    let mut reasons = warnings.to_vec();
     let (_, rows, columns) = error.dim();
     if rows < 3 || columns < 3 {
         return reasons;

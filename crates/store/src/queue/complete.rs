@@ -250,13 +250,16 @@ async fn register(connection: &mut SqliteConnection, job: JobId, record: &Value)
     .await?;
     if let Some(finding) = registered.finding() {
         // An earlier attempt may have added it.
+        let replaced: Vec<_> =
+            registered.superseded().iter().copied().chain([finding.code]).collect();
         sql!(
             "UPDATE jobs SET spec = json_set(spec, '$.warnings', (
                  SELECT json_group_array(json(value)) FROM (
-                     SELECT value FROM json_each(jobs.spec, '$.warnings') WHERE value ->> 'code' <> ?1
+                     SELECT value FROM json_each(jobs.spec, '$.warnings')
+                     WHERE value ->> 'code' NOT IN (SELECT value FROM json_each(?1))
                      UNION ALL SELECT ?2 AS value)))
              WHERE id = ?3",
-            [&finding.code, Json(&finding), job]
+            [Json(&replaced), Json(&finding), job]
         )
         .execute(&mut *connection)
         .await?;
