@@ -41,6 +41,11 @@ UNEVEN = 1.0    # dB that a part is worse, if `uneven_error` is right
 
 
 # ---------------------------------------------------------------- scenes
+def photographs(data):
+    files = sorted(glob.glob(f'{data}/photos/val/*.jpg') + glob.glob(f'{data}/photos/train/*.jpg'))
+    return files or sys.exit(f'no photographs in {data}/photos')
+
+
 def panned(photo, frames, side, step, scale):
     """Frames [frames,side,side] on [0,1] of a camera that moves by `step` pixels per frame over a grey photograph."""
     scale = max(scale, (side + 2) / min(photo.shape))
@@ -317,8 +322,7 @@ class Bench:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.touch()
         self.done = {(row['kind'], row['scene']) for row in read(a.out)}
-        files = sorted(glob.glob(f'{a.data}/photos/val/*.jpg') + glob.glob(f'{a.data}/photos/train/*.jpg'))
-        self.files = files or sys.exit(f'no photographs in {a.data}/photos')
+        self.files = photographs(a.data)
 
     def wanted(self, index, variant):
         for kind in KINDS:
@@ -350,7 +354,7 @@ class Bench:
                 np.save(folder / f'{name}.npy', array)
             command = [self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
                        '--truth-full-scale', '1', '--full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
-                       '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
+                       '--registration', 'off', '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
             done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             if done.returncode == 2:
                 return {'refused': done.stderr.strip()}

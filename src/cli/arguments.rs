@@ -12,7 +12,8 @@ use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
 use crate::config::device;
 use engine::job::{
-    Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, Mosaic, Sequence,
+    Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, Mosaic, RegistrationRequest,
+    Sequence,
 };
 use engine::pipeline::NetworkSource;
 use formats::{Axes, Packing};
@@ -158,6 +159,21 @@ impl ScheduleArguments {
             None => schedule,
         })
     }
+}
+
+/// A registration: `off`, `auto`, or a shift `ROWS,COLUMNS` in pixels.
+pub(super) fn registration(text: &str) -> Result<RegistrationRequest, String> {
+    let wrong = || format!("{text:?}; give off, auto, or ROWS,COLUMNS in pixels, such as 0.5,-1.2");
+    let request = match text {
+        "off" => return Ok(RegistrationRequest::Off),
+        "auto" => return Ok(RegistrationRequest::Auto),
+        shift => {
+            let (rows, columns) = shift.split_once(',').ok_or_else(wrong)?;
+            let pixels = |text: &str| text.trim().parse::<f64>().map_err(|_| wrong());
+            RegistrationRequest::Shift([pixels(rows)?, pixels(columns)?])
+        }
+    };
+    request.error(false).map_or(Ok(request), |error| Err(error.detail))
 }
 
 /// A selection of snapshots: `all`, one index, or `FIRST-LAST` including both ends.

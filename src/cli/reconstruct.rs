@@ -8,13 +8,13 @@ use std::thread;
 use std::time::Instant;
 
 use clap::Args;
-use ndarray::{Array2, Array3, ArrayView3};
+use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{
     DispersionArguments, NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic,
-    packing, sequence,
+    packing, registration, sequence,
 };
 use super::fields::Role;
 use super::model::{Model, cut};
@@ -26,14 +26,15 @@ use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Dispersion, Finding, MaskOrder, Mosaic, SceneShape, Schedule, Sequence,
-    Sha256, keeps_mosaic,
+    Algorithm, Assessment, Dispersion, Finding, MaskOrder, Mosaic, Registered, RegistrationRequest,
+    SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
 };
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
 use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
+use engine::pipeline::registration;
 use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
@@ -41,7 +42,7 @@ use engine::pipeline::write::{check_output, replace_result, write_result};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, Crop, Limits, Packing, Part, planar};
 use reconstruction::sequence::SequencePlan;
-use reconstruction::tile::TilePlan;
+use reconstruction::tile::{TilePlan, Window};
 
 /// Reconstruct the frames of snapshots from files.
 ///
@@ -123,6 +124,10 @@ pub struct Arguments {
     /// The order of the axes in the truth's file.
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     truth_axes: Option<Axes>,
+    /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
+    /// it in pixels.
+    #[arg(long, value_name = "WHICH", default_value = "auto", value_parser = registration, allow_hyphen_values = true)]
+    registration: RegistrationRequest,
     #[command(flatten)]
     schedule: ScheduleArguments,
     /// The network of --algorithm learned: an ONNX file with inputs `measurement [1,1,H,W]` and
@@ -169,7 +174,7 @@ struct Setup {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
-    let input = Input::read(arguments)?;
+    let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
     let algorithm = arguments.schedule.algorithm;
@@ -192,6 +197,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
     let (started, before) = (Instant::now(), cpu_seconds());
     let white = input.white()?;
+    input.register(arguments.registration, white)?;
     let solver = match &setup.model {
         Some(model) => Solver::Network(&model.file),
         None => Solver::Schedule(&setup.schedule),
@@ -346,6 +352,8 @@ struct Input<'a> {
     truth: Option<(Array3<f32>, Channels)>,
     mosaic: Option<Mosaic>,
     findings: Vec<Finding>,
+    /// The registration of the masks, unless it is off.
+    registration: Option<Registered>,
 }
 
 impl<'a> Input<'a> {
@@ -418,7 +426,7 @@ impl<'a> Input<'a> {
         });
         let mut findings: Vec<Finding> = calibration.into_iter().collect();
         findings.extend(intake::combined(read.passed.findings, judged.collect()));
-        Ok(Self { sources, masks, measurement, first, truth, mosaic, findings })
+        Ok(Self { sources, masks, measurement, first, truth, mosaic, findings, registration: None })
     }
 
     fn shape(&self) -> SceneShape {
@@ -442,6 +450,44 @@ impl<'a> Input<'a> {
         Ok(white(self.masks.array.view(), self.measurement.array.view())?)
     }
 
+    /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
+    /// known.
+    fn register(&mut self, request: RegistrationRequest, white: f32) -> Result<()> {
+        let masks = self.masks.array.view();
+        let is_coloured = self.mosaic.is_some() || self.sources.masks.dispersion.is_some();
+        if request.error(is_coloured).is_some() {
+            let text = "--registration: masks of a colour sensor or spectral camera are not moved; calibrate again";
+            return Err(CliError::Input(text.into()));
+        }
+        let light = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0));
+        let y = &self.measurement.array.index_axis(Axis(0), 0) / white;
+        let piece = |place: &Window| {
+            Ok(masks.slice(s![.., place.rows.clone(), place.columns.clone()]).to_owned())
+        };
+        let (light, y) = (light.view(), y.view());
+        let registered =
+            registration::register(request, is_coloured, light, y, piece, &mut |_| true)?;
+        if let Some(registered) = &registered {
+            let superseded = registered.superseded();
+            self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
+            self.findings.extend(registered.finding());
+        }
+        if let Some(shift) = registered.as_ref().and_then(Registered::applied_shift) {
+            let moved = registration::moved(masks, shift);
+            for mut snapshot in self.measurement.array.outer_iter_mut() {
+                let first = moved.index_axis(Axis(0), 0);
+                snapshot.zip_mut_with(&first, |y, mask| {
+                    if mask.is_nan() {
+                        *y = f32::NAN;
+                    }
+                });
+            }
+            self.masks.array = moved.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+        }
+        self.registration = registered;
+        Ok(())
+    }
+
     fn recipe(
         &self,
         setup: &Setup,
@@ -456,6 +502,7 @@ impl<'a> Input<'a> {
             algorithm: setup.algorithm,
             schedule: full_schedule(&setup.schedule, pilot.as_ref()),
             pilot,
+            registration: self.registration.clone(),
             shape: self.shape(),
             dispersion: self.sources.masks.dispersion.clone(),
             inputs: Inputs {

@@ -7,11 +7,14 @@ use serde_json::{Map, Value, json};
 
 use super::CliError;
 use super::arguments::{
-    DispersionArguments, Snapshots, axes, frame_range, mosaic, named_all, packing, sequence,
+    DispersionArguments, Snapshots, axes, frame_range, mosaic, named_all, packing, registration,
+    sequence,
 };
 use super::client::{Client, Result};
 use super::fields::Role;
-use engine::job::{Algorithm, CalibrationId, Dispersion, Mosaic, Sequence, Sha256};
+use engine::job::{
+    Algorithm, CalibrationId, Dispersion, Mosaic, RegistrationRequest, Sequence, Sha256,
+};
 use formats::{Axes, Crop, Packing};
 
 /// Options of the calibration, the measurement and the job.
@@ -109,6 +112,10 @@ pub(super) struct SubmissionArguments {
     /// Least overlap of neighbouring tiles in pixels.
     #[arg(long, value_name = "PIXELS", requires = "tile", help_heading = JOB)]
     overlap: Option<u32>,
+    /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
+    /// it in pixels [default: auto].
+    #[arg(long, value_name = "WHICH", value_parser = registration, allow_hyphen_values = true, help_heading = JOB)]
+    registration: Option<RegistrationRequest>,
     /// From -100 to 100; jobs of higher priority are served first.
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, help_heading = JOB)]
     priority: i32,
@@ -233,6 +240,7 @@ impl SubmissionArguments {
         add(&mut body, "snapshots", self.snapshots.request());
         add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
         add(&mut body, "tile", json!(tile));
+        add(&mut body, "registration", json!(self.registration));
         add(&mut body, "priority", json!(self.priority));
         add(&mut body, "truth", json!(truth));
         add(&mut body, "label", json!(self.label));
@@ -348,6 +356,7 @@ mod tests {
             ("snapshots", "0-3"),
             ("tile", "128"),
             ("overlap", "16"),
+            ("registration", "-0.5,2"),
             ("priority", "-3"),
             ("truth", "t.npy"),
             ("label", "milk"),
@@ -377,6 +386,7 @@ mod tests {
         // The measurement names the calibration.
         assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
         assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));
+        assert_eq!(job["registration"], serde_json::json!({"shift": [-0.5, 2.0]}));
     }
 
     #[test]

@@ -19,8 +19,9 @@ use super::problems;
 use super::truth;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
-    JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape,
-    Schedule, Sequence, Sha256, SnapshotRange, TileSpec, Timestamp, Webhook, priority_error,
+    JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Registered,
+    RegistrationRequest, Role, RunSpec, SceneShape, Schedule, Sequence, Sha256, SnapshotRange,
+    TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
@@ -49,10 +50,13 @@ pub(super) struct JobBody {
     model: Option<ModelId>,
     schedule: Schedule,
     tile: TileSpec,
+    registration: RegistrationRequest,
+    /// The outcome of the registration; null before it, and if it is off.
+    registered: Option<Registered>,
     priority: i32,
     /// The upload with the true frames; null if they are unknown.
     truth: Option<Sha256>,
-    /// Findings of the check of the measurement, and `bad_calibration`.
+    /// Findings of the check of the measurement, `bad_calibration`, and `moved_masks`.
     warnings: Vec<Finding>,
     /// The failure in words.
     error: Option<String>,
@@ -181,6 +185,8 @@ impl JobBody {
             model: spec.model.map(|model| model.id),
             schedule: spec.schedule,
             tile: spec.tile,
+            registration: spec.registration,
+            registered: spec.registered,
             priority: spec.priority,
             truth: spec.truth,
             warnings: spec.warnings,

@@ -16,8 +16,8 @@ use super::jobs::{self, JobBody};
 use super::submissions::make;
 use engine::intake::sample;
 use engine::job::{
-    Algorithm, CalibrationRequest, JobRequest, Label, MeasurementRequest, Sha256,
-    SnapshotSelection, Submission,
+    Algorithm, CalibrationRequest, JobRequest, Label, MeasurementRequest, RegistrationRequest,
+    Sha256, SnapshotSelection, Submission,
 };
 use store::{RequestKey, StagedBlob, Store};
 
@@ -82,6 +82,7 @@ pub(super) async fn create(
         model: None,
         schedule: None,
         tile: None,
+        registration: RegistrationRequest::Off,
         priority: 0,
         truth: Some(truth),
         label: request.label,

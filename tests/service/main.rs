@@ -43,6 +43,7 @@ mod measurement_check;
 mod pictures;
 mod pipeline;
 mod recipes;
+mod registration;
 mod resumable;
 mod samples;
 mod sequences;

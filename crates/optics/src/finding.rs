@@ -73,6 +73,7 @@ pub enum FindingCode {
     Mosaic,
     ShiftedMasks,
     DriftedMasks,
+    MovedMasks,
     TurnedMasks,
     ForeignMasks,
     InvertedMasks,
@@ -337,14 +338,22 @@ impl FindingCode {
                 Error,
                 "the masks fit better when shifted (by up to 32 pixels)",
                 "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
-                 calibration: calibrate again",
+                 calibration: calibrate again (a job with `registration` auto corrects up to 4 pixels)",
             ),
             Self::DriftedMasks => (
                 &[Measurement],
                 Warning,
                 Warning,
                 "the masks are displaced by a fraction of a pixel",
-                "calibrate again once the optics are stable; if the finding stays, record dark frames and name them as `dark`",
+                "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
+                 finding stays, record dark frames and name them as `dark`",
+            ),
+            Self::MovedMasks => (
+                &[Job],
+                Warning,
+                Warning,
+                "the masks have moved since the calibration; the job has corrected them",
+                "calibrate again once the optics are stable",
             ),
             Self::TurnedMasks => (
                 &[Measurement],

@@ -179,6 +179,7 @@ impl Lab {
             model: None,
             schedule: None,
             tile: Some(TileSpec { size: 64, overlap: 8 }),
+            registration: engine::job::RegistrationRequest::Off,
             priority,
             truth: None,
             label: None,

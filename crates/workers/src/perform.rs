@@ -27,7 +27,7 @@ use engine::pipeline::scale::Histogram;
 use engine::pipeline::tile::{reconstruct_tile, run_network};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{write_manifest, write_result};
-use engine::pipeline::{movie, preview, scale};
+use engine::pipeline::{movie, preview, registration, scale};
 use formats::planar::{self, Reader};
 use formats::{Limits, StackInfo};
 use reconstruction::sequence::RunShare;
@@ -49,11 +49,14 @@ pub(super) fn perform(
     monitor: &Monitor,
 ) -> Result<Done, TaskError> {
     let (record, output) = match input {
-        TaskInput::Prepare { arrays, snapshots } => {
+        TaskInput::Prepare { arrays, snapshots, registration, is_coloured } => {
             arrays.verify()?;
             let white = scale::job_white_level(&arrays, snapshots, monitor)?;
+            let job = (&arrays, snapshots);
+            let registration =
+                registration::register_stored(job, (registration, is_coloured), white, monitor)?;
             monitor.reach(TaskStage::Reading, 1.0);
-            (json(&PreparedRecord { white })?, Output::Record)
+            (json(&PreparedRecord { white, registration })?, Output::Record)
         }
         TaskInput::Preview { arrays, shape, snapshot, white } => {
             let frames = preview::frames(&arrays, shape, snapshot, white, monitor)?;

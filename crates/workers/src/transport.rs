@@ -13,7 +13,8 @@ use tokio::runtime::Handle;
 
 use engine::intake::{CaptureFiles, IntakeError};
 use engine::job::{
-    JobId, JobSpec, Mosaic, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange, TaskProgress,
+    JobId, JobSpec, Mosaic, RegistrationRequest, ResultFile, SceneShape, Schedule, Sha256,
+    SnapshotRange, TaskProgress,
 };
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
@@ -107,10 +108,12 @@ pub struct Claim {
 /// The work of a task, with its complete input.
 #[derive(Debug)]
 pub enum TaskInput {
-    /// Estimate the solver's scale of a job.
+    /// Estimate the solver's scale of a job, and register its masks.
     Prepare {
         arrays: Arrays,
         snapshots: SnapshotRange,
+        registration: RegistrationRequest,
+        is_coloured: bool,
     },
     Preview {
         arrays: Arrays,
@@ -183,6 +186,9 @@ pub struct Check {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTask {
     pub masks: Sha256,
+    /// Pixels by which the masks have moved down and to the right.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shift: Option<[f64; 2]>,
     pub measurement: Sha256,
     /// The run of snapshots that the tile belongs to, as indices in the measurement.
     pub snapshots: Range<u32>,

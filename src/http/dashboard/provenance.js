@@ -116,6 +116,7 @@ function repeat(found) {
     ...(last > found.snapshots.first ? { sequence: found.sequence } : {}),
     ...(found.model ? { model: found.model } : { schedule: found.schedule }),
     tile: found.tile,
+    registration: found.registration,
     priority: found.priority,
     label: found.label,
   };

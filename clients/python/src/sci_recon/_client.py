@@ -105,6 +105,7 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
+        registration: str | Mapping[str, Sequence[float]] | None = None,
         priority: int = 0,
         truth: Source | None = None,
         label: str | None = None,
@@ -160,6 +161,7 @@ class Client:
             schedule=schedule,
             tile=tile,
             model=model,
+            registration=registration,
             priority=priority,
             truth=truth,
             label=label,
@@ -290,6 +292,7 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
+        registration: str | Mapping[str, Sequence[float]] | None = None,
         priority: int = 0,
         truth: Source | None = None,
         label: str | None = None,
@@ -298,9 +301,11 @@ class Client:
     ) -> Job:
         """Submits a job without waiting for it.
 
-        `snapshots` is "all", an index from 0, or (first, last), both included. `truth` [B, H, W] has the true frames, if they
-        are known: the dashboard shows PSNR and SSIM against them. A repeated request with the same `key`
-        returns the job of the first one. The service notifies `webhook`, an address, when the job ends.
+        `snapshots` is "all", an index from 0, or (first, last), both included. `registration` "auto", the default,
+        corrects masks that have moved since the calibration; {"shift": (rows, columns)} states the shift in pixels, and
+        "off" uses the calibrated masks. `truth` [B, H, W] has the true frames, if they are known: the dashboard shows PSNR
+        and SSIM against them. A repeated request with the same `key` returns the job of the first one. The service notifies
+        `webhook`, an address, when the job ends.
         """
         return Job(
             self,
@@ -314,6 +319,7 @@ class Client:
                 schedule=schedule,
                 tile=tile,
                 model=model,
+                registration=registration,
                 priority=priority,
                 truth=None if truth is None else self.upload(truth),
                 label=label,

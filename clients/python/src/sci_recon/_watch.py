@@ -8,6 +8,7 @@ single job even if the program is restarted.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import time
@@ -171,7 +172,7 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
         bad_pixels=options.pop("bad_pixels", None),
         **{keyword: options.pop(option, None) for option, keyword in mask_options.items()},
     )
-    job_options = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "truth", "label", "webhook"}
+    job_options = set(inspect.signature(Client.submit).parameters) - {"self", "measurement", "sequence", "key"}
     job = {name: value for name, value in options.items() if name in job_options}
     measurement = {name: value for name, value in options.items() if name not in job_options}
 

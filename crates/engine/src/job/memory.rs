@@ -122,6 +122,8 @@ mod tests {
             model: None,
             schedule: algorithm.default_schedule(),
             tile: TileSpec { size: side, overlap: 0 },
+            registration: crate::job::RegistrationRequest::Off,
+            registered: None,
             priority: 0,
             truth: None,
             label: None,

@@ -9,6 +9,7 @@ mod memory;
 mod model;
 mod pool;
 mod reading;
+mod registration;
 mod report;
 mod request;
 mod shape;
@@ -31,6 +32,7 @@ pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::{InvalidPool, Pool};
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
+pub use registration::{Registered, RegistrationRequest};
 pub use report::{
     CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, PatternReport,
     Severity,

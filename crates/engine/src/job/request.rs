@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
+use super::registration::{Registered, RegistrationRequest};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
@@ -122,6 +123,10 @@ pub struct JobRequest {
     /// The tiles; by default those of the algorithm, or the whole picture for a network of fixed size.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
+    /// `auto` estimates and corrects a displacement of the masks since the calibration, `{"shift": [rows, columns]}`
+    /// states it in pixels, and `off` uses the masks as they were calibrated; by default `auto`.
+    #[serde(default, skip_serializing_if = "RegistrationRequest::is_auto")]
+    pub registration: RegistrationRequest,
     /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
     #[schemars(range(min = -100, max = 100))]
@@ -159,6 +164,11 @@ pub struct JobSpec {
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
+    #[serde(default = "RegistrationRequest::off")]
+    pub registration: RegistrationRequest,
+    /// The outcome of the registration; `None` before it, and if it is off.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub registered: Option<Registered>,
     pub priority: i32,
     /// The upload with the true frames.
     pub truth: Option<Sha256>,
@@ -220,6 +230,7 @@ impl JobRequest {
             errors.push(InvalidField::new("/tile", error.to_string()));
             Cut { tile, run: RunSpec::ALONE }
         });
+        errors.extend(self.registration.error(shape.mosaic.is_some()));
         errors.extend(priority_error(self.priority));
         if !errors.is_empty() {
             return Err(errors);
@@ -239,6 +250,8 @@ impl JobRequest {
             model,
             schedule,
             tile,
+            registration: self.registration,
+            registered: None,
             priority,
             truth,
             label,
@@ -302,11 +315,14 @@ impl JobSpec {
 
     /// The job for a spectral camera, if there is a dispersion.
     ///
-    /// Errors: snapshots that are to be reconstructed together.
+    /// Errors: a stated shift of the masks, or snapshots that are to be reconstructed together.
     pub fn with_dispersion(
         self,
         dispersion: Option<Dispersion>,
     ) -> Result<Self, Vec<InvalidField>> {
+        if let Some(error) = self.registration.error(dispersion.is_some()) {
+            return Err(vec![error]);
+        }
         if dispersion.is_some() && self.sequence == Sequence::Contiguous {
             let detail = "the bands of two spectral snapshots do not continue one another: leave the sequence out";
             return Err(vec![InvalidField::new("/sequence", detail)]);

@@ -72,7 +72,9 @@ impl TileAssessment {
             ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, 254.0) as u8
         };
         let (_, rows, columns) = errors.dim();
-        let motion = fastest(outcome.frames.view(), white);
+        // The estimate of frames that are mostly wrong is unbounded, and the server refuses impossible records.
+        let (_, height, width) = outcome.frames.dim();
+        let motion = fastest(outcome.frames.view(), white).max(0.0).min((height + width) as f32);
         let levels = errors.iter().map(level).collect();
         let prediction = evidence.and_then(|evidence| evidence.prediction);
         let order = evidence.and_then(|evidence| evidence.order);

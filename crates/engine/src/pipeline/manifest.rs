@@ -13,7 +13,7 @@ use super::networks::ModelRecord;
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
 use crate::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
-    MeasurementId, Mosaic, ResultFile, SceneShape, Schedule, Sha256, TaskKind,
+    MeasurementId, Mosaic, Registered, ResultFile, SceneShape, Schedule, Sha256, TaskKind,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -39,6 +39,9 @@ pub struct Recipe {
     /// The decisions of the pilot that led to this schedule.
     pub pilot: Option<PilotRecord>,
     pub inputs: Inputs,
+    /// The registration of the masks, unless it is off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registration: Option<Registered>,
     /// The networks of the schedule, or the model of the job.
     pub models: Vec<ModelRecord>,
     pub scale: ScaleRecord,
@@ -389,6 +392,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         algorithm: Algorithm::GapTv,
         schedule: Schedule::gap_tv(),
         pilot: None,
+        registration: None,
         shape: SceneShape { frames, height: 20, width: 24, snapshots: 2, mosaic: None },
         inputs: Inputs {
             masks_sha256: hash,
