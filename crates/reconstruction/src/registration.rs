@@ -559,8 +559,8 @@ mod tests {
             let found = registered(&calibrated, moved.view(), sigma);
             println!("{cells:?} {found:?}");
             assert!(found.applied && found.error_after < found.error_before, "{found:?}");
-            for axis in 0..2 {
-                assert!((found.shift[axis] - expected[axis]).abs() < 0.1, "{cells:?} {found:?}");
+            for (axis, expected) in expected.into_iter().enumerate() {
+                assert!((found.shift[axis] - expected).abs() < 0.1, "{cells:?} {found:?}");
             }
         }
         let mut flipped = calibrated.clone();
