@@ -13,7 +13,8 @@ pub(super) enum Role {
 /// Fields of both roles. The option of the masks is `--masks-` and the name, that of the measurement the name alone.
 const SHARED: [&str; 6] = ["array", "axes", "crop", "frames", "full_scale", "packing"];
 /// Fields with one option.
-const SINGLE: [&str; 5] = ["dark", "saturation", "bad_pixels", "mosaic", "sequence"];
+const SINGLE: [&str; 6] =
+    ["dark", "saturation", "bad_pixels", "mosaic", "sequence", "registration"];
 
 fn option(name: &str, role: Role) -> String {
     let name = name.replace('_', "-");
