@@ -389,7 +389,7 @@ async fn arrays_can_have_any_name() {
     lab.write("plain.npy", &Scene::SMALL.snapshots());
     let line = [&["submit", "plain.npy", "--array", "shots"][..], &masks, &scale].concat();
     let refused = lab.refused(2, &line).await;
-    assert!(refused.contains("omit `array`"), "{refused}");
+    assert!(refused.contains("omit `--array`"), "{refused}");
 }
 
 /// Adds 50 files, two of them equal, while the watcher is killed repeatedly.

@@ -657,7 +657,7 @@ def sheared(mask: npt.NDArray[Any], dispersion: Record, size: tuple[int, int]) -
     axis = 1 if dispersion["axis"] == "column" else 0
     masks = np.zeros((len(dispersion["offsets"]), *size))
     for band, offset in zip(np.moveaxis(masks, axis + 1, -1), dispersion["offsets"], strict=True):
-        along = np.moveaxis(np.asarray(mask, np.float64).reshape(mask.shape[-2:]), axis, -1)
+        along = np.moveaxis(np.asarray(mask, np.float64).reshape(mask.shape[-2], mask.shape[-1]), axis, -1)
         whole, fraction = int(offset), offset - int(offset)
         for start, weight in ((whole, 1 - fraction), (whole + 1, fraction)):
             count = max(0, min(along.shape[-1], band.shape[-1] - start))
