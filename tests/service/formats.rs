@@ -357,7 +357,7 @@ scipy.io.savemat('masks.mat', {'codes': masks.transpose(1, 2, 0), 'other': masks
     let dark = app.upload(read("several.mat")).await;
     let body = json!({"calibration": calibration, "data": data, "dark": [dark]});
     let answer = app.post("/v1/measurements", &body).await;
-    let detail = answer.problem(422, "unsupported_content");
+    let detail = answer.problem(422, "invalid_content");
     assert!(detail.contains("'a', 'b'") && detail.contains("save the array alone"), "{detail}");
 
     let run = |masks: &str, more: &[&str]| {
