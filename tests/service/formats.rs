@@ -335,7 +335,7 @@ async fn the_only_array_of_a_file_needs_no_name() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let folder = tempfile::tempdir().unwrap();
     let script = "import h5py, numpy, scipy.io, sys
-dark, masks = numpy.full((2, 48, 64), 3, 'u2'), numpy.load('masks.npy')
+dark, masks = numpy.full((2, 48, 64), 0.01, 'f4'), numpy.load('masks.npy')
 scipy.io.savemat('dark.mat', {'black_level': dark.transpose(1, 2, 0)}, do_compression=True)
 h5py.File('dark.h5', 'w')['entry/black_level'] = dark
 numpy.savez('dark.npz', black_level=dark)
