@@ -11,19 +11,17 @@ file in FOLDER for this binary: an interrupted run continues where it stopped. T
 """
 import argparse
 import concurrent.futures
-import hashlib
 import json
 import os
 import pathlib
 import subprocess
 import sys
 import tempfile
-import threading
 
 import cv2
 import numpy as np
 
-from wrong_inputs import panned, photographs, read
+from wrong_inputs import Runs, panned, read
 
 KINDS = 'iid', 'iid-blurred', 'random-squares', 'rotating-circle'
 RATIOS = 8, 10, 12, 16, 20
@@ -91,15 +89,9 @@ def simulated(binary, kind, ratio, side, seed):
 
 
 # ---------------------------------------------------------------- runs
-class Bench:
+class Bench(Runs):
     def __init__(self, a):
-        with open(a.binary, 'rb') as file:
-            name = hashlib.file_digest(file, 'sha256').hexdigest()[:12]
-        self.a, self.path, self.lock = a, pathlib.Path(a.out) / f'{name}.jsonl', threading.Lock()
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.touch()
-        self.done = {row['case'] for row in read(a.out)}
-        self.files = photographs(a.data)
+        super().__init__(a, lambda row: row['case'])
 
     def case(self, index):
         if index in self.done:
@@ -113,8 +105,7 @@ class Bench:
             if drift == 'none':
                 arms += [('flipped', case.calibrated[:, :, ::-1], 'off'), ('flipped_registered', case.calibrated[:, :, ::-1], 'auto')]
             runs[drift] = {name: self.reconstruct(masks, y, case.frames, option) for name, masks, option in arms}
-        with self.lock, open(self.path, 'a') as file:
-            file.write(json.dumps({'case': index} | case.about() | runs) + '\n')
+        self.keep({'case': index} | case.about() | runs)
 
     def reconstruct(self, masks, y, truth, option):
         with tempfile.TemporaryDirectory() as folder:

@@ -314,15 +314,26 @@ KINDS = [
 
 
 # ---------------------------------------------------------------- runs
-class Bench:
-    def __init__(self, a):
+class Runs:
+    """Resumable runs of a program, whose rows are in a file for this binary. `key` identifies the run of a row."""
+
+    def __init__(self, a, key):
         with open(a.binary, 'rb') as file:
             name = hashlib.file_digest(file, 'sha256').hexdigest()[:12]
         self.a, self.path, self.lock = a, pathlib.Path(a.out) / f'{name}.jsonl', threading.Lock()
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.touch()
-        self.done = {(row['kind'], row['scene']) for row in read(a.out)}
+        self.done = {key(row) for row in read(a.out)}
         self.files = photographs(a.data)
+
+    def keep(self, row):
+        with self.lock, open(self.path, 'a') as file:
+            file.write(json.dumps(row) + '\n')
+
+
+class Bench(Runs):
+    def __init__(self, a):
+        super().__init__(a, lambda row: (row['kind'], row['scene']))
 
     def wanted(self, index, variant):
         for kind in KINDS:
@@ -339,8 +350,7 @@ class Bench:
             scene = Scene(self.a.binary, self.files, index, variant, self.a.side)
             for kind in kinds:
                 row = {'kind': kind.name, 'scene': index, 'about': scene.describe()} | self.reconstruct(kind.make(scene))
-                with self.lock, open(self.path, 'a') as file:
-                    file.write(json.dumps(row) + '\n')
+                self.keep(row)
 
     def reconstruct(self, given):
         with tempfile.TemporaryDirectory() as folder:

@@ -13,33 +13,52 @@ use super::error::Result;
 #[derive(Debug, Args)]
 pub struct ExecArguments {
     /// Shell command that runs each time a job has ended. JOB_ID, JOB_STATE, JOB_LABEL, JOB_ERROR and JOB_VERDICT describe
-    /// the job; watch-folder also sets JOB_FILE and JOB_RESULTS [default: none].
+    /// the job; watch-folder also sets JOB_FILE and JOB_RESULTS, and runs it for refused files, too [default: none].
     #[arg(long, value_name = "COMMAND")]
     exec: Option<String>,
 }
 
+/// The end of a job, or of a file that was refused.
+#[derive(Debug, Default)]
+pub(super) struct End {
+    pub(super) job: String,
+    pub(super) state: String,
+    pub(super) label: String,
+    pub(super) error: String,
+    pub(super) verdict: String,
+}
+
+impl End {
+    pub(super) fn of(job: &Job) -> Self {
+        Self {
+            job: job.id.clone(),
+            state: job.state.to_string(),
+            label: job.label.clone().unwrap_or_default(),
+            error: job.error.clone().unwrap_or_default(),
+            verdict: job.verdict().unwrap_or_default(),
+        }
+    }
+}
+
 impl ExecArguments {
-    /// Runs the command for a job that has ended. `files` are the submitted file and the folder or file of its results.
+    /// Runs the command. `files` are the submitted file and the folder or file of its results.
     ///
     /// Errors: the command does not end with 0.
-    pub(super) async fn run(&self, job: &Job, files: Option<(&Path, &Path)>) -> Result<()> {
+    pub(super) async fn run(&self, end: &End, files: Option<(&Path, &Path)>) -> Result<()> {
         let Some(line) = &self.exec else { return Ok(()) };
         let mut command = Command::new("sh");
-        command.arg("-c").arg(line).kill_on_drop(true).env("JOB_ID", &job.id);
-        command.env("JOB_STATE", job.state.to_string());
-        command.env("JOB_LABEL", job.label.as_deref().unwrap_or_default());
-        command.env("JOB_ERROR", job.error.as_deref().unwrap_or_default());
-        command.env("JOB_VERDICT", job.verdict().unwrap_or_default());
+        command.arg("-c").arg(line).kill_on_drop(true);
+        command.env("JOB_ID", &end.job).env("JOB_STATE", &end.state);
+        command.env("JOB_LABEL", &end.label).env("JOB_ERROR", &end.error);
+        command.env("JOB_VERDICT", &end.verdict);
         if let Some((file, results)) = files {
             command.env("JOB_FILE", file).env("JOB_RESULTS", results);
         }
-        let failed =
-            |reason: String| CliError::Failure(format!("--exec for job {}: {reason}", job.id));
+        let failed = |reason: String| CliError::Failure(format!("--exec: {reason}"));
         let status = command.status().await.map_err(|error| failed(error.to_string()))?;
-        if status.success() {
-            Ok(())
-        } else {
-            Err(failed(format!("the command ended with {status}")))
+        match status.success() {
+            true => Ok(()),
+            false => Err(failed(format!("the command ended with {status}"))),
         }
     }
 }

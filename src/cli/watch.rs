@@ -7,7 +7,7 @@ use serde_json::json;
 use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
-use super::exec::ExecArguments;
+use super::exec::{End, ExecArguments};
 use super::output::print_line;
 use super::progress;
 use super::verdict;
@@ -53,7 +53,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
                 let job = client.job(id, wait).await?;
                 progress::show(bar, job.progress.percent / 100.0);
                 if job.state.is_final() {
-                    arguments.exec.run(&job, None).await?;
+                    arguments.exec.run(&End::of(&job), None).await?;
                     return Ok::<Job, CliError>(job);
                 }
                 // The service answers at once if too many requests of the lab wait.

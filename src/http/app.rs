@@ -58,7 +58,7 @@ pub struct Services {
     pub(super) machine: Machine,
 }
 
-/// The state of what runs jobs.
+/// The state of the cluster, the confinement and the device of the workers.
 #[derive(Debug)]
 pub struct Machine {
     /// Why no tile can leave this machine; `None` if none should.

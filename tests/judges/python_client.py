@@ -7,11 +7,13 @@ import io
 import json
 import os
 import re
+import socket
 import sys
 import warnings
 from base64 import b64decode
 from pathlib import Path
 
+import httpx
 import npe2
 import numpy as np
 import sci_recon
@@ -22,9 +24,7 @@ from sci_recon import ApiError, Client
 def napari(result):
     """Opens the job by its addresses, and a folder of results, as napari does."""
     manager = npe2.PluginManager.instance()
-    manifest = npe2.PluginManifest.from_file(
-        Path(sci_recon.__file__).parent / "napari.yaml"
-    )
+    manifest = npe2.PluginManifest.from_file(Path(sci_recon.__file__).parent / "napari.yaml")
     manifest.validate_imports()
     manager.register(manifest)
     folder = result.download("frames.npy", result.snapshots[0]).parent
@@ -70,11 +70,7 @@ def unreachable():
             raise AssertionError("there is no service")
         except sci_recon.SciReconError as error:
             assert "127.0.0.1:9" in str(error), error
-    found = [
-        str(warning.message)
-        for warning in issued
-        if warning.category is sci_recon.ConnectionWarning
-    ]
+    found = [str(warning.message) for warning in issued if warning.category is sci_recon.ConnectionWarning]
     assert len(found) == 1 and "127.0.0.1:9" in found[0], issued
 
 
@@ -82,24 +78,15 @@ def main():
     folder = Path(sys.argv[1])
     masks = np.load(folder / "masks.npy")
     with Client() as client:
-        result = client.reconstruct(
-            masks, folder / "measurement.npy", "gap-tv", folder=folder / "result"
-        )
+        result = client.reconstruct(masks, folder / "measurement.npy", "gap-tv", folder=folder / "result")
         frames = result.frames
         snapshots, count = len(result.snapshots), len(masks)
-        assert (
-            frames.shape == (snapshots * count, *masks.shape[1:])
-            and frames.dtype == np.float32
-        )
+        assert frames.shape == (snapshots * count, *masks.shape[1:]) and frames.dtype == np.float32
         measurement = np.load(folder / "measurement.npy")
         for snapshot in range(snapshots):
             again = (masks * frames[snapshot * count :][:count]).sum(axis=0)
-            difference = np.linalg.norm(again - measurement[snapshot]) / np.linalg.norm(
-                measurement[snapshot]
-            )
-            assert difference < 0.05, (
-                f"snapshot {snapshot} does not fit its measurement: {difference}"
-            )
+            difference = np.linalg.norm(again - measurement[snapshot]) / np.linalg.norm(measurement[snapshot])
+            assert difference < 0.05, f"snapshot {snapshot} does not fit its measurement: {difference}"
         stack = result.download("stack.exr", snapshot=1)
         assert stack.read_bytes()[:4] == bytes([0x76, 0x2F, 0x31, 0x01])
         error, blocks = (
@@ -108,43 +95,27 @@ def main():
         )
         k, i, j = np.indices(result.snapshot(1).shape)
         assert (error == blocks[k, i // 16, j // 16]).all()
-        assert (
-            result.assessment
-            == client.job(result.job.id).record["assessment"]
-            is not None
-        )
+        assert result.assessment == client.job(result.job.id).record["assessment"] is not None
         assert result.movie(format="gif").read_bytes()[:6] == b"GIF89a"
         for movie in (result.movie(), result.movie(snapshot=1)):
-            assert (
-                movie.read_bytes()[4:8] == b"ftyp"
-                and movie.parent.parent == folder / "result"
-            )
+            assert movie.read_bytes()[4:8] == b"ftyp" and movie.parent.parent == folder / "result"
         assert not list(stack.parent.glob("*.part"))
         assert result.manifest["content"]["schedule"]
         text = repr(result)
-        assert (
-            result.job.verdict in text
-            and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text
-        ), text
+        assert result.job.verdict in text and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text, (
+            text
+        )
         napari(result)
         jupyter(result)
         assert result.download("stack.tif", snapshot=1).read_bytes()[:2] == b"II"
         with warnings.catch_warnings(record=True) as issued:
             warnings.simplefilter("always")
             wrong = client.reconstruct(masks[:, ::-1], measurement, "gap-tv")
-        found = [
-            str(warning.message)
-            for warning in issued
-            if warning.category is sci_recon.FindingWarning
-        ]
+        found = [str(warning.message) for warning in issued if warning.category is sci_recon.FindingWarning]
         assert found and all("Remedy: " in text for text in found), issued
-        assert len({text.split(":")[0] for text in found}) == len(found), (
-            "a line for each finding"
-        )
+        assert len({text.split(":")[0] for text in found}) == len(found), "a line for each finding"
         code = wrong.job.findings[0]["code"]
-        assert (
-            code in found[0] and code in repr(wrong) and code in wrong._repr_html_()
-        ), (found, wrong)
+        assert code in found[0] and code in repr(wrong) and code in wrong._repr_html_(), (found, wrong)
         wrong.job.delete()
         # A rejection raises the service's message, without a retry.
         try:
@@ -155,9 +126,7 @@ def main():
             assert str(error).count("above the full scale") == 1, error
         # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
-        assert later.state == "succeeded" and later.id in [
-            job.id for job in client.jobs()
-        ]
+        assert later.state == "succeeded" and later.id in [job.id for job in client.jobs()]
         unreachable()
         print(json.dumps({"job": later.id, "frames": list(frames.shape)}))
 

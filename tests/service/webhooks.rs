@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use tokio::net::TcpListener;
 
 use crate::app::{TestApp, judges};
-use crate::samples::Scene;
+use crate::samples::{Scene, constant};
 
 /// Requests that a receiver got: headers and bodies.
 type Received = Arc<Mutex<Vec<(HeaderMap, String)>>>;
@@ -133,6 +133,18 @@ async fn a_command_runs_when_a_job_has_ended() {
     let output = run("echo \"$JOB_ID $JOB_STATE $JOB_LABEL $JOB_VERDICT\" > ended");
     let text = std::fs::read_to_string(folder.path().join("ended")).unwrap();
     assert!(text.starts_with(&format!("{job} succeeded it's ")), "{text} {output:?}");
+    // A watched folder runs it for a refused file, too, once the reason is written.
+    std::fs::write(folder.path().join("masks.npy"), Scene::SMALL.masks()).unwrap();
+    std::fs::write(folder.path().join("small.npy"), constant(&[1, 8, 8], 0.5)).unwrap();
+    let exec = "cat \"$JOB_RESULTS\" > refused; echo \"$JOB_STATE $JOB_FILE\" >> refused";
+    let mut watch = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    watch.args(["watch-folder", ".", "--once", "--settle-seconds", "0.1", "--exec", exec]);
+    watch.args(["--masks", "masks.npy", "--algorithm", "gap-tv"]).current_dir(&folder);
+    watch.env("SCI_RECON_URL", format!("http://{}", app.address()));
+    let output = watch.output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let text = std::fs::read_to_string(folder.path().join("refused")).unwrap();
+    assert!(text.contains("size_mismatch") && text.contains("failed /"), "{text}");
     let output = run("exit 7");
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stderr).contains("exit status: 7"), "{output:?}");

@@ -26,7 +26,7 @@ const ACCEPTED: &str =
 pub struct Wanted<'a> {
     /// The role of the array in the scene.
     pub array: SceneArray,
-    /// Name of the array in the file; `None` for [`SceneArray::name`].
+    /// Name of the array in the file; `None` for [`SceneArray::name`], or for the only array.
     pub name: Option<&'a str>,
     /// Prior knowledge about its shape.
     pub expected: Expected,

@@ -557,7 +557,6 @@ mod tests {
             let moved = by_areas(6, side, cells);
             let expected = cells.map(|cell| cell as f64 / 4.0);
             let found = registered(&calibrated, moved.view(), sigma);
-            println!("{cells:?} {found:?}");
             assert!(found.applied && found.error_after < found.error_before, "{found:?}");
             for (axis, expected) in expected.into_iter().enumerate() {
                 assert!((found.shift[axis] - expected).abs() < 0.1, "{cells:?} {found:?}");
@@ -569,7 +568,6 @@ mod tests {
         assert!(!found.applied && !found.converged, "{found:?}");
         for sigma in [0.0, 0.02] {
             let found = registered(&calibrated, calibrated.view(), sigma);
-            println!("{found:?}");
             assert!(!found.applied, "{found:?}");
         }
     }

@@ -24,7 +24,7 @@ use uuid::Uuid;
 use super::CliError;
 use super::client::{Client, ClientError, Job, ServiceArguments, Wanted, rename_new};
 use super::error::Result;
-use super::exec::ExecArguments;
+use super::exec::{End, ExecArguments};
 use super::output::print_line;
 use super::submission::{Recipe, SubmissionArguments};
 use super::verdict;
@@ -220,6 +220,7 @@ impl Watch<'_> {
             self.failed += 1;
             self.write_failure(&entry, reason)?;
         }
+        self.exec(&entry, &stage).await;
         self.record(Entry { stage, ..entry })
     }
 
@@ -250,7 +251,6 @@ impl Watch<'_> {
     async fn fetch(&mut self, entry: &Entry, job: &str) -> Result<Option<Stage>, ClientError> {
         let job = self.client.job(job, 0).await?;
         if let Some(reason) = job.failure() {
-            self.exec(entry, &job, &failure_file(&entry.results)).await;
             let findings = verdict::lines(&job.findings());
             let reason = [vec![reason], findings].concat().join("\n");
             return Ok(Some(Stage::Failed { reason }));
@@ -261,7 +261,6 @@ impl Watch<'_> {
         let folder = self.folder.join(result_folder(&entry.results));
         self.client.fetch(&job, &self.arguments.files, &folder).await?;
         self.write_report(entry, &job, &folder)?;
-        self.exec(entry, &job, &result_folder(&entry.results)).await;
         Ok(Some(Stage::Done { job: job.id }))
     }
 
@@ -317,10 +316,30 @@ impl Watch<'_> {
         self.ledger.record(entry)
     }
 
-    /// Runs the command of the user before the ledger names the end of the job, so that a kill can't leave it out.
-    async fn exec(&self, entry: &Entry, job: &Job, results: &str) {
+    /// Runs the command of the user for a file that has ended. The ledger does not name the end yet, so that a kill can't
+    /// leave the command out.
+    async fn exec(&self, entry: &Entry, stage: &Stage) {
+        let job = match &entry.stage {
+            Stage::Submitted { job } => job.clone(),
+            _ => String::new(),
+        };
+        let end = End { job, label: entry.shot.name.clone(), ..End::default() };
+        let (end, results) = match stage {
+            Stage::Taken | Stage::Submitted { .. } => return,
+            Stage::Failed { reason } => {
+                let (state, error) = ("failed".to_owned(), reason.clone());
+                (End { state, error, ..end }, failure_file(&entry.results))
+            }
+            Stage::Done { .. } => {
+                let last = self.results.last();
+                let verdict = last
+                    .map(|(findings, assessment)| verdict::verdict(assessment.as_ref(), findings));
+                let (state, verdict) = ("succeeded".to_owned(), verdict.unwrap_or_default());
+                (End { state, verdict, ..end }, result_folder(&entry.results))
+            }
+        };
         let (file, results) = (self.folder.join(&entry.shot.name), self.folder.join(results));
-        if let Err(error) = self.arguments.exec.run(job, Some((&file, &results))).await {
+        if let Err(error) = self.arguments.exec.run(&end, Some((&file, &results))).await {
             eprintln!("sci-recon: {error}");
         }
     }

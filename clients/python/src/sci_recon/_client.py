@@ -639,9 +639,9 @@ class Result:
 
     def _export(self, href: str, path: Path) -> Path:
         """Downloads a file that the service composes of stored ones. Its ETag identifies the content."""
-        http, href = self.job.client.http, f"/v1/jobs/{self.job.id}/{href}"
-        etag = transfer.send(http, "HEAD", href).headers["ETag"].strip('"')
         if not path.is_file():
+            http, href = self.job.client.http, f"/v1/jobs/{self.job.id}/{href}"
+            etag = transfer.send(http, "HEAD", href).headers["ETag"].strip('"')
             with self.job.client._bar(f"download {path.name}") as bar:
                 transfer.download(http, href, path, etag, bar, composed=True)
         return path

@@ -57,7 +57,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
     findings.extend(read);
     findings.extend(others);
     findings.extend(bad_pixels);
-    // A copy of masks has no scale of its own.
+    // If masks were sent as the measurement, their scale is an effect.
     findings.sort_by_key(|finding| !finding.is(BinaryMeasurement));
     findings
 }

@@ -19,7 +19,7 @@ use formats::{
 pub struct Source<'a> {
     pub path: &'a Path,
     pub array: SceneArray,
-    /// Name of the array in the file; `None` for [`SceneArray::name`].
+    /// Name of the array in the file; `None` for [`SceneArray::name`], or for the only array.
     pub named: Option<String>,
     /// Order of the axes; `None` for automatic detection.
     pub axes: Option<Axes>,

@@ -25,11 +25,6 @@ pub enum RegistrationRequest {
 }
 
 impl RegistrationRequest {
-    /// The request of jobs that are older than the registration of masks.
-    pub(super) fn off() -> Self {
-        Self::Off
-    }
-
     /// True for the default.
     pub(super) fn is_auto(&self) -> bool {
         *self == Self::Auto

@@ -164,10 +164,9 @@ pub struct JobSpec {
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
-    #[serde(default = "RegistrationRequest::off")]
     pub registration: RegistrationRequest,
     /// The outcome of the registration; `None` before it, and if it is off.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub registered: Option<Registered>,
     pub priority: i32,
     /// The upload with the true frames.

@@ -27,11 +27,8 @@ pub fn register(
     piece: impl FnOnce(&Window) -> Result<Array3<f32>>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Option<Registered>> {
-    match request {
-        RegistrationRequest::Off => return Ok(None),
-        RegistrationRequest::Shift(shift) => return Ok(Some(Registered::stated(shift))),
-        RegistrationRequest::Auto if is_coloured => return Ok(Some(Registered::skipped(COLOUR))),
-        RegistrationRequest::Auto => {}
+    if let Some(outcome) = without_estimate(request, is_coloured) {
+        return Ok(outcome);
     }
     let Some((rows, columns)) = registration::choose(light, y) else {
         return Ok(Some(Registered::skipped(SMALL)));
@@ -43,6 +40,15 @@ pub fn register(
     Ok(Some(found.map_or_else(|| Registered::skipped(DARK), Registered::from)))
 }
 
+/// The outcome of a request that needs no estimate.
+fn without_estimate(request: RegistrationRequest, is_coloured: bool) -> Option<Option<Registered>> {
+    match request {
+        RegistrationRequest::Off => Some(None),
+        RegistrationRequest::Shift(shift) => Some(Some(Registered::stated(shift))),
+        RegistrationRequest::Auto => is_coloured.then(|| Some(Registered::skipped(COLOUR))),
+    }
+}
+
 /// Registers the masks of a job by its first snapshot. It reads one piece of fixed size of all masks.
 ///
 /// Errors: those of reading and of the solver; a stop by the monitor.
@@ -52,8 +58,9 @@ pub fn register_stored(
     white: f32,
     monitor: &Monitor,
 ) -> Result<Option<Registered>> {
-    if request == RegistrationRequest::Off {
-        return Ok(None);
+    // Without an estimate nothing is read.
+    if let Some(outcome) = without_estimate(request, is_coloured) {
+        return Ok(outcome);
     }
     let first = snapshots.first;
     let y = arrays.snapshot(first)? / white;

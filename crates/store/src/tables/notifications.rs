@@ -75,17 +75,20 @@ impl Store {
 
     /// The key that signs the notifications of a lab. The first call, and each with `renew`, draws a new one.
     pub async fn webhook_secret(&self, lab: &Lab, renew: bool) -> Result<Vec<u8>> {
-        let mut transaction = self.write().await?;
+        const FOUND: &str = "SELECT secret FROM webhook_secrets WHERE lab = ?";
+        if !renew && let Some(secret) = sql_as!(FOUND, [lab]).fetch_optional(&self.readers).await? {
+            return Ok(secret);
+        }
         let fresh: [u8; 32] = rand::rng().random();
-        let text = if renew {
-            "INSERT INTO webhook_secrets VALUES (?, ?)
-             ON CONFLICT (lab) DO UPDATE SET secret = excluded.secret"
-        } else {
-            "INSERT INTO webhook_secrets VALUES (?, ?) ON CONFLICT (lab) DO NOTHING"
-        };
-        sql!(text, [lab, fresh.to_vec()]).execute(&mut *transaction).await?;
-        let secret = sql_as!("SELECT secret FROM webhook_secrets WHERE lab = ?", [lab]);
-        let secret = secret.fetch_one(&mut *transaction).await?;
+        let mut transaction = self.write().await?;
+        sql!(
+            "INSERT INTO webhook_secrets VALUES (?1, ?2)
+             ON CONFLICT (lab) DO UPDATE SET secret = iif(?3, excluded.secret, secret)",
+            [lab, fresh.to_vec(), renew]
+        )
+        .execute(&mut *transaction)
+        .await?;
+        let secret = sql_as!(FOUND, [lab]).fetch_one(&mut *transaction).await?;
         transaction.commit().await?;
         Ok(secret)
     }
