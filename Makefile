@@ -8,7 +8,7 @@ JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
 .PHONY: release version install dist dist-check wheel demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
-	bench-latency bench-peers bench-scale eval-models eval-loop eval-wrong-inputs evaluation-data
+	bench-latency bench-peers bench-scale eval-models eval-loop eval-registration eval-wrong-inputs eval-real evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
 	$(CARGO) run --release --quiet -- demo
@@ -172,6 +172,18 @@ eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## test whether th
 		--data $(DATA) --out eval-output/wrong-inputs --algorithm $(ALGORITHM) --good $(GOOD) --scenes $(WRONG)
 GOOD ?= 60
 WRONG ?= 20
+eval-registration: evaluation-data $(TRAINING)/.stamp runtime ## test whether moved masks are found and corrected; ALGORITHM=gap-tv CASES=40
+	@$(CARGO) build --release --quiet
+	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
+		$(TRAINING)/bin/python research/assessment/registration.py run $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		--data $(DATA) --out eval-output/registration --algorithm $(ALGORITHM) --cases $(CASES)
+CASES ?= 40
+
+eval-real: $(TRAINING)/.stamp ## compare the masks of published spectral captures with wrong ones; REAL=folder ALGORITHM=gap-tv
+	@$(CARGO) build --release --quiet
+	@$(TRAINING)/bin/python research/assessment/real_captures.py $${CARGO_TARGET_DIR:-target}/release/sci-recon \
+		--data $(REAL) --algorithm $(ALGORITHM)
+REAL ?= ../shared/scenes/real
 
 evaluation-data:
 	@test -f $(DATA)/INDEX.tsv || { echo "no footage at DATA=$(DATA): a folder with INDEX.tsv," \

@@ -111,7 +111,7 @@ CREATE TABLE partials (
     id         TEXT PRIMARY KEY,
     lab        TEXT NOT NULL,
     token      TEXT REFERENCES tokens (id),
-    length     INTEGER NOT NULL CHECK (length > 0), -- bytes of the whole file
+    length     INTEGER CHECK (length > 0), -- bytes of the whole file; NULL until the client states them
     received   INTEGER NOT NULL DEFAULT 0 CHECK (received BETWEEN 0 AND length),
     metadata   TEXT NOT NULL, -- as the client sent it
     expected   TEXT, -- SHA-256 that the client states for the whole file
@@ -162,6 +162,8 @@ CREATE TABLE calibrations (
     clipped_negatives INTEGER NOT NULL,
     -- The colours of a cell of 2x2 pixels, row by row; NULL for a grey sensor.
     mosaic            TEXT CHECK (mosaic IN ('rggb', 'bggr', 'grbg', 'gbrg')),
+    -- Displacement of the bands of a spectral camera, as JSON; NULL for masks that were uploaded one by one.
+    dispersion        TEXT,
     reading           TEXT, -- how the masks' file was read, as JSON; NULL for captures
     created_at        INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
@@ -234,6 +236,7 @@ CREATE TABLE jobs (
     calibration  TEXT NOT NULL REFERENCES calibrations (id),
     measurement  TEXT NOT NULL REFERENCES measurements (id),
     model        TEXT REFERENCES models (id),
+    truth        TEXT REFERENCES blobs (sha256), -- the true frames, if they are known
     label        TEXT,
     spec         TEXT NOT NULL, -- JobSpec as JSON
     state        TEXT NOT NULL CHECK (state IN
@@ -261,6 +264,24 @@ CREATE INDEX jobs_finished ON jobs (finished_at, id) WHERE finished_at IS NOT NU
 CREATE INDEX jobs_calibration ON jobs (calibration);
 CREATE INDEX jobs_measurement ON jobs (measurement);
 CREATE INDEX jobs_model ON jobs (model);
+CREATE INDEX jobs_truth ON jobs (truth) WHERE truth IS NOT NULL;
+
+CREATE TABLE notifications (
+    -- Unsent notifications of jobs that have ended.
+    id       INTEGER PRIMARY KEY AUTOINCREMENT,
+    job      TEXT NOT NULL UNIQUE REFERENCES jobs (id) ON DELETE CASCADE,
+    attempts INTEGER NOT NULL DEFAULT 0,
+    next_at  INTEGER, -- time of the next attempt; NULL if it was given up
+    error    TEXT -- why the last attempt failed
+) STRICT;
+
+CREATE INDEX notifications_due ON notifications (next_at) WHERE next_at IS NOT NULL;
+
+CREATE TABLE webhook_secrets (
+    -- Keys that sign the notifications of each lab. Receivers have a copy.
+    lab    TEXT PRIMARY KEY,
+    secret BLOB NOT NULL CHECK (length(secret) = 32)
+) STRICT, WITHOUT ROWID;
 
 CREATE TABLE removals (
     -- Files whose rows are deleted, until the files are removed. A start after a kill continues with them.
@@ -620,7 +641,7 @@ BEGIN
     INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
 END;
 
-CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority ON jobs
+CREATE TRIGGER changes_of_jobs_change AFTER UPDATE OF state, label, priority, truth ON jobs
 BEGIN
     INSERT INTO changes (what, lab, id) VALUES ('job', NEW.lab, NEW.id);
 END;
@@ -670,6 +691,13 @@ CREATE TRIGGER changes_of_request_tasks_change AFTER UPDATE OF state, fraction O
     WHEN NEW.thing IS NOT NULL AND (OLD.state <> NEW.state OR OLD.fraction <> NEW.fraction)
 BEGIN
     INSERT INTO changes (what, lab, id) SELECT what, lab, id FROM requests WHERE id = NEW.thing;
+END;
+
+CREATE TRIGGER notifications_add AFTER UPDATE OF state ON jobs
+    WHEN NEW.state IN ('succeeded', 'failed', 'cancelled') AND OLD.state <> NEW.state
+         AND json_extract(NEW.spec, '$.webhook') IS NOT NULL
+BEGIN
+    INSERT OR REPLACE INTO notifications (job, next_at) VALUES (NEW.id, 0);
 END;
 
 CREATE TRIGGER upload_keys_end AFTER DELETE ON partials

@@ -1,16 +1,17 @@
 #!/usr/bin/env bash
 # Install libonnxruntime.so from the pinned PyPI wheel into runtime/ or another folder.
 #
-#   scripts/fetch-onnxruntime.sh [--gpu] [FOLDER]
+#   scripts/fetch-onnxruntime.sh [--gpu | --cuda] [FOLDER]
 #
+# --gpu installs the library with the WebGPU provider (any GPU), --cuda the one for NVIDIA's CUDA and cuDNN.
 # pip checks the wheel's hash. A stamp file makes a second run a no-op.
 set -euo pipefail
 package=onnxruntime
 version=1.31.1
-if [ "${1:-}" = --gpu ]; then
-  package=onnxruntime_gpu
-  shift
-fi
+case "${1:-}" in
+  --gpu) package=onnxruntime_webgpu version=1.27.0; shift ;;
+  --cuda) package=onnxruntime_gpu; shift ;;
+esac
 system=$(uname -sm)
 case "$package $system" in
   "onnxruntime Linux x86_64")
@@ -22,6 +23,9 @@ case "$package $system" in
   "onnxruntime_gpu Linux x86_64")
     platform=manylinux_2_28_x86_64
     sha256=e26c475fe361b2015f45b4b824bd13f0bb20204e59b62814e6f0acd5f3d491a6 ;;
+  "onnxruntime_webgpu Linux x86_64")
+    platform=manylinux_2_28_x86_64
+    sha256=142eb8bdb803c58117bf64164d201f43180bc87229cac14b590aa4ea79e0f70b ;;
   *)
     echo "fetch-onnxruntime: no wheel of $package is pinned for $system;" \
          "put a libonnxruntime 1.24 or later into the folder runtime by hand" >&2

@@ -17,6 +17,7 @@ strip "$folder/bin/sci-recon"
 # The program looks for the library relative to its location.
 install -m 644 "$root"/runtime/libonnxruntime*.so "$folder/lib/sci-recon/"
 install -m 644 "$root"/runtime/onnxruntime-* "$root/LICENSE" "$share/doc/sci-recon/"
+install -m 644 "$root/src/http/reference/LICENSE.txt" "$share/doc/sci-recon/redoc-LICENSE"
 # The program includes its networks; these files are for training and for `--models`.
 cp -R "$root/models" "$root/docs/schedule.schema.json" "$share/sci-recon/"
 for unit in "$root"/deploy/systemd/*.service "$root"/deploy/systemd/*.timer; do

@@ -23,6 +23,9 @@ pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {
     None => env!("CARGO_PKG_VERSION"),
 };
 
+/// Exit code of a worker that lost its GPU: EX_TEMPFAIL of sysexits.h.
+pub(crate) const DEVICE_LOST: u8 = 75;
+
 /// Run the HTTP service, its dashboard and its workers.
 #[derive(Debug, Clone, Args)]
 pub struct ServeArguments {
@@ -59,6 +62,16 @@ pub struct ServeArguments {
     /// `X-Forwarded-For` or `Forwarded`. They must set that header, not pass on the one of the client.
     #[arg(long, env = "SCI_RECON_TRUSTED_PROXIES", value_name = "NETWORK", value_delimiter = ',', value_parser = network)]
     pub trusted_proxies: Vec<IpNet>,
+
+    /// Hosts that may be notified when jobs end, separated by commas, with the port unless it is the default one of http or
+    /// https. Jobs with a webhook on another host are refused [default: none].
+    #[arg(
+        long = "webhook-host",
+        env = "SCI_RECON_WEBHOOK_HOSTS",
+        value_name = "HOST",
+        value_delimiter = ','
+    )]
+    pub webhook_hosts: Vec<String>,
 
     /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
     /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
@@ -366,8 +379,9 @@ pub struct EngineArguments {
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
-    /// Device that runs networks: cpu, or cuda:0 for the first GPU.
-    #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu")]
+    /// Device that runs networks: cpu, gpu (the first GPU of any vendor), or cuda:N (NVIDIA, from 0).
+    #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu",
+          value_parser = device)]
     pub device: String,
 
     /// Nice value of workers (0 to 19), so that the API responds under full load. A process with a higher nice value keeps
@@ -385,6 +399,22 @@ pub struct EngineArguments {
     /// another worker tries the task.
     #[arg(long, env = "SCI_RECON_STALL_SECONDS", value_name = "SECONDS", default_value_t = 300)]
     pub stall_seconds: u64,
+}
+
+/// A device in its shortest form.
+pub(crate) fn device(text: &str) -> Result<String, String> {
+    Device::parse(text).map(|device| device.to_string()).map_err(|error| error.to_string())
+}
+
+/// State of the device of a server's workers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum DeviceState {
+    /// No worker has tried it.
+    Untried,
+    /// A worker has run a network on it.
+    Ready,
+    /// A worker can't use it, for this reason.
+    Refused(String),
 }
 
 /// A time in seconds, above 0 and up to a day.
@@ -530,6 +560,13 @@ impl WorkerArguments {
             return None;
         }
         self.data.as_deref()
+    }
+
+    /// Memory limit of the process in bytes. A process with a GPU has none, because the driver maps far more memory than
+    /// it uses; processes of users' networks have it in any case.
+    #[must_use]
+    pub fn memory_limit(&self) -> Option<u64> {
+        self.memory_bytes.filter(|_| self.engine.device == "cpu")
     }
 
     /// The command line with these arguments, for a worker process of this machine.

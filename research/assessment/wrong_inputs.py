@@ -41,6 +41,11 @@ UNEVEN = 1.0    # dB that a part is worse, if `uneven_error` is right
 
 
 # ---------------------------------------------------------------- scenes
+def photographs(data):
+    files = sorted(glob.glob(f'{data}/photos/val/*.jpg') + glob.glob(f'{data}/photos/train/*.jpg'))
+    return files or sys.exit(f'no photographs in {data}/photos')
+
+
 def panned(photo, frames, side, step, scale):
     """Frames [frames,side,side] on [0,1] of a camera that moves by `step` pixels per frame over a grey photograph."""
     scale = max(scale, (side + 2) / min(photo.shape))
@@ -280,6 +285,7 @@ KINDS = [
     Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
 
     Kind('masks of another calibration', ('foreign_masks',), with_masks(lambda s: s.other), masks=True),
+    Kind('inverted masks (1 - C)', ('inverted_masks',), with_masks(lambda s: 1 - s.masks), masks=True),
     Kind('masks flipped from left to right', ('turned_masks',), with_masks(lambda s: s.masks[:, :, ::-1]), masks=True),
     Kind('masks flipped upside down', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1]), masks=True),
     Kind('masks turned by 180 degrees', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1, ::-1]), masks=True),
@@ -308,16 +314,26 @@ KINDS = [
 
 
 # ---------------------------------------------------------------- runs
-class Bench:
-    def __init__(self, a):
+class Runs:
+    """Resumable runs of a program, whose rows are in a file for this binary. `key` identifies the run of a row."""
+
+    def __init__(self, a, key):
         with open(a.binary, 'rb') as file:
             name = hashlib.file_digest(file, 'sha256').hexdigest()[:12]
         self.a, self.path, self.lock = a, pathlib.Path(a.out) / f'{name}.jsonl', threading.Lock()
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.touch()
-        self.done = {(row['kind'], row['scene']) for row in read(a.out)}
-        files = sorted(glob.glob(f'{a.data}/photos/val/*.jpg') + glob.glob(f'{a.data}/photos/train/*.jpg'))
-        self.files = files or sys.exit(f'no photographs in {a.data}/photos')
+        self.done = {key(row) for row in read(a.out)}
+        self.files = photographs(a.data)
+
+    def keep(self, row):
+        with self.lock, open(self.path, 'a') as file:
+            file.write(json.dumps(row) + '\n')
+
+
+class Bench(Runs):
+    def __init__(self, a):
+        super().__init__(a, lambda row: (row['kind'], row['scene']))
 
     def wanted(self, index, variant):
         for kind in KINDS:
@@ -334,8 +350,7 @@ class Bench:
             scene = Scene(self.a.binary, self.files, index, variant, self.a.side)
             for kind in kinds:
                 row = {'kind': kind.name, 'scene': index, 'about': scene.describe()} | self.reconstruct(kind.make(scene))
-                with self.lock, open(self.path, 'a') as file:
-                    file.write(json.dumps(row) + '\n')
+                self.keep(row)
 
     def reconstruct(self, given):
         with tempfile.TemporaryDirectory() as folder:
@@ -348,8 +363,8 @@ class Bench:
             for name, array in arrays.items():
                 np.save(folder / f'{name}.npy', array)
             command = [self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
-                       '--truth-full-scale', '1', '--measurement-full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
-                       '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
+                       '--truth-full-scale', '1', '--full-scale', str(given.full or given.counts() * given.stated), '--algorithm', self.a.algorithm,
+                       '--registration', 'off', '--threads', '1', '--json', '--out', folder / 'out', *options, *given.options]
             done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             if done.returncode == 2:
                 return {'refused': done.stderr.strip()}

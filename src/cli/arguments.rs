@@ -10,7 +10,11 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use super::CliError;
 use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
-use engine::job::{Algorithm, InvalidField, Mosaic, Sequence};
+use crate::config::device;
+use engine::job::{
+    Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, Mosaic, RegistrationRequest,
+    Sequence,
+};
 use engine::pipeline::NetworkSource;
 use formats::{Axes, Packing};
 use reconstruction::priors::onnx::Device;
@@ -33,14 +37,90 @@ pub(super) struct ScheduleArguments {
     iterations: Option<u32>,
 }
 
+/// The displacement of the bands of a spectral camera.
+#[derive(Debug, Args)]
+pub(super) struct DispersionArguments {
+    /// Displacement of each band of a spectral camera (CASSI) in pixels: START:STEP:COUNT, a list separated by commas, or a
+    /// file with a JSON list. The masks of all bands are then made from one mask [row, column].
+    #[arg(long, value_name = "LIST")]
+    dispersion_offsets: Option<Numbers>,
+    /// `column` if the bands are displaced to the right, `row` if downwards.
+    #[arg(long, value_name = "AXIS", default_value_t = DispersionAxis::Column, value_parser = dispersion_axis(),
+          requires = "dispersion_offsets")]
+    dispersion_axis: DispersionAxis,
+    /// Wavelength of each band in nm, in the same form as the offsets [default: none].
+    #[arg(long, value_name = "LIST", requires = "dispersion_offsets")]
+    dispersion_wavelengths: Option<Numbers>,
+    /// The size of the mask: `scene` is that of a band, `measurement` that of the measurement.
+    #[arg(long, value_name = "SIZE", default_value_t = MaskExtent::Scene, value_parser = mask_extent(),
+          requires = "dispersion_offsets")]
+    dispersion_mask: MaskExtent,
+}
+
+impl DispersionArguments {
+    /// The dispersion, if there are offsets.
+    pub(super) fn resolve(&self) -> Result<Option<Dispersion>> {
+        let Some(offsets) = &self.dispersion_offsets else { return Ok(None) };
+        let dispersion = Dispersion {
+            axis: self.dispersion_axis,
+            offsets: offsets.0.clone(),
+            wavelengths: self.dispersion_wavelengths.as_ref().map(|lengths| lengths.0.clone()),
+            mask: self.dispersion_mask,
+        };
+        match dispersion.check() {
+            Ok(()) => Ok(Some(dispersion)),
+            Err(error) => Err(CliError::Input(format!("--dispersion: {}", error.detail))),
+        }
+    }
+}
+
+/// A number for each band.
+#[derive(Debug, Clone, PartialEq)]
+struct Numbers(Vec<f64>);
+
+impl FromStr for Numbers {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number =
+            |text: &str| text.trim().parse::<f64>().map_err(|_| format!("{text:?} is no number"));
+        if let [start, step, count] = text.split(':').collect::<Vec<_>>()[..]
+            && let Ok(count) = count.trim().parse::<u16>()
+        {
+            let (start, step) = (number(start)?, number(step)?);
+            return Ok(Self((0..count).map(|band| start + step * f64::from(band)).collect()));
+        }
+        if text.contains(',') || number(text).is_ok() {
+            return text.split(',').map(number).collect::<Result<_, _>>().map(Self);
+        }
+        let unreadable = |error: &dyn std::fmt::Display| {
+            format!(
+                "{error}; state START:STEP:COUNT, a list separated by commas, or a file with a JSON list"
+            )
+        };
+        let list = fs::read_to_string(text).map_err(|error| unreadable(&error))?;
+        serde_json::from_str(&list).map(Self).map_err(|error| unreadable(&error))
+    }
+}
+
+fn dispersion_axis() -> impl TypedValueParser<Value = DispersionAxis> {
+    PossibleValuesParser::new(DispersionAxis::VARIANTS)
+        .try_map(|name: String| name.parse::<DispersionAxis>())
+}
+
+fn mask_extent() -> impl TypedValueParser<Value = MaskExtent> {
+    PossibleValuesParser::new(MaskExtent::VARIANTS)
+        .try_map(|name: String| name.parse::<MaskExtent>())
+}
+
 /// Runtime and device of networks.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
     /// Path of libonnxruntime [default: next to the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
-    /// Device that runs networks: cpu, or cuda:0 for the first GPU.
-    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    /// Device that runs networks: cpu, gpu (the first GPU of any vendor), or cuda:N (NVIDIA, from 0).
+    #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = device)]
     device: String,
 }
 
@@ -79,6 +159,21 @@ impl ScheduleArguments {
             None => schedule,
         })
     }
+}
+
+/// A registration: `off`, `auto`, or a shift `ROWS,COLUMNS` in pixels.
+pub(super) fn registration(text: &str) -> Result<RegistrationRequest, String> {
+    let wrong = || format!("{text:?}; give off, auto, or ROWS,COLUMNS in pixels, such as 0.5,-1.2");
+    let request = match text {
+        "off" => return Ok(RegistrationRequest::Off),
+        "auto" => return Ok(RegistrationRequest::Auto),
+        shift => {
+            let (rows, columns) = shift.split_once(',').ok_or_else(wrong)?;
+            let pixels = |text: &str| text.trim().parse::<f64>().map_err(|_| wrong());
+            RegistrationRequest::Shift([pixels(rows)?, pixels(columns)?])
+        }
+    };
+    request.error(false).map_or(Ok(request), |error| Err(error.detail))
 }
 
 /// A selection of snapshots: `all`, one index, or `FIRST-LAST` including both ends.
@@ -140,10 +235,16 @@ impl NetworkArguments {
         Ok(())
     }
 
+    /// The networks on the stated device.
+    ///
+    /// # Errors
+    /// The device can't run a network; the text has the remedy.
     pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable counts as not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
-        Ok(NetworkSource::new(library, Device::parse(&self.device)?))
+        let source = NetworkSource::new(library, Device::parse(&self.device)?);
+        source.try_device()?;
+        Ok(source)
     }
 }
 
@@ -198,7 +299,7 @@ fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> +
 
 #[cfg(test)]
 mod tests {
-    use super::ScheduleArguments;
+    use super::{Numbers, ScheduleArguments};
     use clap::Parser;
     use engine::job::Algorithm;
     use std::fs;
@@ -211,6 +312,21 @@ mod tests {
 
     fn parse(arguments: &[&str]) -> ScheduleArguments {
         Command::try_parse_from([&["test"], arguments].concat()).unwrap().schedule
+    }
+
+    #[test]
+    fn numbers_of_bands_are_a_range_a_list_or_a_file() {
+        let numbers = |text: &str| text.parse::<Numbers>().map(|numbers| numbers.0);
+        assert_eq!(numbers("450:7.5:3"), Ok(vec![450.0, 457.5, 465.0]));
+        assert_eq!(numbers("0, 2.5,1"), Ok(vec![0.0, 2.5, 1.0]));
+        assert_eq!(numbers("3"), Ok(vec![3.0]));
+        let file = tempfile::NamedTempFile::new().unwrap();
+        fs::write(file.path(), "[0, 2, 4.5]").unwrap();
+        assert_eq!(numbers(file.path().to_str().unwrap()), Ok(vec![0.0, 2.0, 4.5]));
+        for bad in ["0:2", "0:2:x", "1,a", "missing.json", ""] {
+            assert!(numbers(bad).is_err(), "{bad}");
+        }
+        assert!(numbers("0:2").unwrap_err().contains("START:STEP:COUNT"));
     }
 
     #[test]

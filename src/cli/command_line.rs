@@ -45,6 +45,7 @@ enum Command {
     WatchFolder(super::watch_folder::Arguments),
     Serve(config::ServeArguments),
     Worker(config::WorkerArguments),
+    Devices(super::devices::Arguments),
     Health(super::health::Arguments),
     Token(super::token::Arguments),
     Lab(super::lab::Arguments),
@@ -88,7 +89,7 @@ enum ConfigAction {
 /// Headings of the help, and the commands below each.
 const GROUPS: [(&str, &[&str]); 4] = [
     ("Lab machine", &["submit", "watch", "fetch", "ls", "cancel", "watch-folder"]),
-    ("Server", &["serve", "worker", "health"]),
+    ("Server", &["serve", "worker", "devices", "health"]),
     (
         "Administration",
         &[
@@ -160,6 +161,7 @@ fn perform(arguments: Arguments) -> Result<()> {
         Command::WatchFolder(arguments) => super::watch_folder::run(&arguments),
         Command::Serve(arguments) => super::serve::run(&arguments).map_err(CliError::from),
         Command::Worker(arguments) => super::worker::run(&arguments),
+        Command::Devices(arguments) => super::devices::run(&arguments),
         Command::Health(arguments) => super::health::run(&arguments),
         Command::Token(arguments) => super::token::run(&arguments),
         Command::Lab(arguments) => super::lab::run(&arguments),

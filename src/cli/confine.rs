@@ -117,8 +117,6 @@ pub(super) fn confine_network(readable: &[&Path]) -> Result<(), String> {
 pub(super) fn confinement(engine: &EngineArguments) -> Result<(), String> {
     let reason = if engine.unconfined {
         "--unconfined was given".to_owned()
-    } else if engine.device != "cpu" {
-        "the driver of a GPU needs files that can't be listed".to_owned()
     } else {
         let Err(reason) = check_landlock() else { return Ok(()) };
         reason

@@ -4,7 +4,9 @@ use std::fmt::Display;
 use std::path::Path;
 use std::process::ExitCode;
 
+use super::fields::{Role, as_options};
 use super::serve::ServeError;
+use crate::config::DEVICE_LOST;
 use engine::intake::IntakeError;
 use engine::pipeline::PipelineError;
 use engine::pipeline::networks::NetworkError;
@@ -25,6 +27,9 @@ pub enum CliError {
     /// The work is done, but the checks found errors in the input; exit code 3.
     #[error("{0}")]
     ErrorsFound(String),
+    /// A worker lost its GPU, and another process must replace it.
+    #[error("{0}")]
+    DeviceLost(String),
     /// The reader of standard output has closed it. The command then ends with success.
     #[error("standard output is closed")]
     Unread,
@@ -36,7 +41,16 @@ impl CliError {
             Self::Input(_) => ExitCode::from(2),
             Self::Failure(_) => ExitCode::FAILURE,
             Self::ErrorsFound(_) => ExitCode::from(3),
+            Self::DeviceLost(_) => ExitCode::from(DEVICE_LOST),
             Self::Unread => ExitCode::SUCCESS,
+        }
+    }
+
+    /// The error with the options of the command line in place of the fields of the API.
+    pub(super) fn about(self, role: Role) -> Self {
+        match self {
+            Self::Input(text) => Self::Input(as_options(&text, role)),
+            other => other,
         }
     }
 
@@ -49,9 +63,10 @@ impl From<ReconError> for CliError {
     fn from(error: ReconError) -> Self {
         let text = error.to_string();
         match error {
-            ReconError::Runtime(_) | ReconError::Diverged { .. } | ReconError::Cancelled => {
-                Self::Failure(text)
-            }
+            ReconError::Runtime(_)
+            | ReconError::DeviceLost(_)
+            | ReconError::Diverged { .. }
+            | ReconError::Cancelled => Self::Failure(text),
             _ => Self::Input(text),
         }
     }

@@ -57,6 +57,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             }))?,
             false => files.iter().try_for_each(|file| print_line(file.display()))?,
         }
-        verdict::refuse_errors([&*findings])
+        verdict::refuse_bad([(&*findings, job.assessment.as_ref())])
     })
 }

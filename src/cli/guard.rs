@@ -40,6 +40,7 @@ pub(super) async fn guard(cache: &Path, stop: impl Future<Output = ()>) -> Resul
         died = match judge(status) {
             WorkerEnd::Left => return Ok(()),
             WorkerEnd::Killed => Some("killed".to_owned()),
+            WorkerEnd::DeviceLost => Some("its GPU was lost".to_owned()),
             WorkerEnd::Starved(how) | WorkerEnd::Crashed(how) => Some(how),
         };
         tracing::error!(how = died, "the worker process has died and is restarted");

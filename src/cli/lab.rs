@@ -10,6 +10,7 @@ use super::wait::print_of_store;
 use crate::audit::AuditLog;
 use crate::cli::error::Result;
 use crate::config::AuditArguments;
+use crate::webhooks::secret_text;
 use engine::job::{Lab, Sha256};
 use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 
@@ -48,6 +49,14 @@ enum Action {
     Remove {
         /// The lab's name.
         lab: Lab,
+    },
+    /// Print the secret with which the notifications of a lab are signed.
+    WebhookSecret {
+        /// The lab's name.
+        lab: Lab,
+        /// Replace the secret by a new one.
+        #[arg(long)]
+        new: bool,
     },
     /// Set the share and the quotas of a lab.
     Set {
@@ -105,6 +114,19 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
             let change = change("lab remove", lab, lab.to_string());
             audited(log, change, async { Ok(store.remove_lab(lab).await?) }).await?;
             return Ok(format!("removed {lab}"));
+        }
+        Action::WebhookSecret { lab, new } => {
+            if !store.knows_lab(lab).await? && *lab != Lab::local() {
+                return Err(CliError::Input(format!("there is no lab {lab}")));
+            }
+            let read = async { Ok(store.webhook_secret(lab, *new).await?) };
+            let secret = match new {
+                true => {
+                    audited(log, change("lab webhook-secret", lab, lab.to_string()), read).await
+                }
+                false => read.await,
+            };
+            return Ok(secret_text(&secret?));
         }
         Action::Set { lab, new, share, bytes, jobs } => {
             if !new && !store.knows_lab(lab).await? {

@@ -9,6 +9,7 @@ mod client;
 mod command_line;
 mod confine;
 mod error;
+mod exec;
 #[cfg(feature = "nats")]
 mod guard;
 mod logging;
@@ -31,7 +32,9 @@ pub mod check_model;
 #[cfg(feature = "nats")]
 pub mod cluster;
 pub mod demo;
+pub mod devices;
 pub mod fetch;
+mod fields;
 pub mod health;
 pub mod job;
 pub mod lab;

@@ -8,30 +8,33 @@ use std::thread;
 use std::time::Instant;
 
 use clap::Args;
-use ndarray::{Array2, Array3, ArrayView3};
+use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{
-    NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic, packing, sequence,
+    DispersionArguments, NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic,
+    packing, registration, sequence,
 };
+use super::fields::Role;
 use super::model::{Model, cut};
 use super::output::print_line;
 use super::progress::SnapshotBar;
 use super::verdict;
 use crate::cli::error::Result;
 use engine::intake::{
-    self, Behind, Exposure, Scaled, Source, read_masks, read_snapshots, read_truth,
+    self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Finding, MaskOrder, Mosaic, SceneShape, Schedule, Sequence, Sha256,
-    keeps_mosaic,
+    Algorithm, Assessment, Dispersion, Finding, MaskOrder, Mosaic, Registered, RegistrationRequest,
+    SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
 };
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
 use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
+use engine::pipeline::registration;
 use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
@@ -39,7 +42,7 @@ use engine::pipeline::write::{check_output, replace_result, write_result};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, Crop, Limits, Packing, Part, planar};
 use reconstruction::sequence::SequencePlan;
-use reconstruction::tile::TilePlan;
+use reconstruction::tile::{TilePlan, Window};
 
 /// Reconstruct the frames of snapshots from files.
 ///
@@ -80,8 +83,8 @@ pub struct Arguments {
     masks_full_scale: Option<f32>,
     /// Value in the measurement's file that means 1 [default: 255 for uint8 and .mat scenes,
     /// 65535 for uint16, 1 for floats].
-    #[arg(long, value_name = "VALUE")]
-    measurement_full_scale: Option<f32>,
+    #[arg(long, alias = "measurement-full-scale", value_name = "VALUE")]
+    full_scale: Option<f32>,
     /// Value in the truth's file that means 1 [default: as for the measurement].
     #[arg(long, value_name = "VALUE")]
     truth_full_scale: Option<f32>,
@@ -89,6 +92,14 @@ pub struct Arguments {
     /// colours ([frame, row, column, 3]) or be a mosaic [default: a grey sensor].
     #[arg(long, value_name = "NAME", value_parser = mosaic())]
     mosaic: Option<Mosaic>,
+    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
+    #[arg(long, value_name = "NAME")]
+    masks_array: Option<String>,
+    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
+    #[arg(long, value_name = "NAME")]
+    array: Option<String>,
+    #[command(flatten)]
+    dispersion: DispersionArguments,
     /// The order of the axes in the masks' file [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     masks_axes: Option<Axes>,
@@ -102,17 +113,21 @@ pub struct Arguments {
     #[arg(long, value_name = "NAME", value_parser = packing())]
     masks_packing: Option<Packing>,
     /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
-    #[arg(long, value_name = "WINDOW")]
-    measurement_crop: Option<Crop>,
+    #[arg(long, alias = "measurement-crop", value_name = "WINDOW")]
+    crop: Option<Crop>,
     /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
-    #[arg(long, value_name = "NAME", value_parser = packing())]
-    measurement_packing: Option<Packing>,
+    #[arg(long, alias = "measurement-packing", value_name = "NAME", value_parser = packing())]
+    packing: Option<Packing>,
     /// The order of the axes in the measurement's file.
-    #[arg(long, value_name = "ORDER", value_parser = axes())]
-    measurement_axes: Option<Axes>,
+    #[arg(long, alias = "measurement-axes", value_name = "ORDER", value_parser = axes())]
+    axes: Option<Axes>,
     /// The order of the axes in the truth's file.
     #[arg(long, value_name = "ORDER", value_parser = axes())]
     truth_axes: Option<Axes>,
+    /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
+    /// it in pixels.
+    #[arg(long, value_name = "WHICH", default_value = "auto", value_parser = registration, allow_hyphen_values = true)]
+    registration: RegistrationRequest,
     #[command(flatten)]
     schedule: ScheduleArguments,
     /// The network of --algorithm learned: an ONNX file with inputs `measurement [1,1,H,W]` and
@@ -159,7 +174,7 @@ struct Setup {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
-    let input = Input::read(arguments)?;
+    let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
     let algorithm = arguments.schedule.algorithm;
@@ -172,7 +187,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         (algorithm, &schedule),
         (arguments.tile, arguments.overlap),
         model.as_ref(),
-        (arguments.sequence, snapshots.len() as u32),
+        (input.sequence(arguments.sequence), snapshots.len() as u32),
         dim,
     )?;
     let (plan, runs) = (shape.tile_plan(cut.tile)?, cut.run.plan(snapshots.clone())?);
@@ -182,6 +197,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 
     let (started, before) = (Instant::now(), cpu_seconds());
     let white = input.white()?;
+    input.register(arguments.registration, white)?;
     let solver = match &setup.model {
         Some(model) => Solver::Network(&model.file),
         None => Solver::Schedule(&setup.schedule),
@@ -215,16 +231,21 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let frames = sequence.masks.dim().0;
     let solved_frame =
         |index| solved.frame(&sequence, input.first + index / frames, index % frames);
+    let dispersion = input.sources.masks.dispersion.as_ref();
+    let frame = |index| match dispersion {
+        Some(bands) => bands.unshear(solved_frame(index).view(), index % frames),
+        None => solved_frame(index),
+    };
     let compare = |(truth, channels): &(Array3<f32>, Channels)| {
         let frame = |index| match (arguments.mosaic, channels) {
             (Some(mosaic), Channels::Rgb) => mosaic.demosaick(solved_frame(index).view(), (0, 0)),
-            _ => solved_frame(index),
+            _ => frame(index),
         };
         Quality::compare(frame, truth.view(), *channels)
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
     let mut histogram = Histogram::default();
-    (0..frames * snapshots.len()).for_each(|index| histogram.add(&solved_frame(index)));
+    (0..frames * snapshots.len()).for_each(|index| histogram.add(&frame(index)));
     let white_level = white_level(&histogram, white);
     let recipe = input.recipe(&setup, (white, white_level), &solved)?;
     let expected = |snapshot| {
@@ -246,7 +267,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
     }
     report.print(arguments)?;
-    verdict::refuse_errors([&*report.findings])
+    verdict::refuse_bad([(&*report.findings, report.assessment.as_ref())])
 }
 
 /// The output folder of each snapshot.
@@ -281,27 +302,33 @@ impl<'a> Sources<'a> {
         let scene = arguments.scene.as_deref();
         let named = |file: &'a Option<PathBuf>| file.as_deref().or(scene);
         let missing = || CliError::Input("give --masks and --measurement, or --scene".into());
+        let dispersion = arguments.dispersion.resolve()?;
+        if dispersion.is_some() && arguments.mosaic.is_some() {
+            let text =
+                "a spectral camera has a grey sensor: leave out --mosaic or --dispersion-offsets";
+            return Err(CliError::Input(text.into()));
+        }
         Ok(Self {
             masks: Source::file(
                 named(&arguments.masks).ok_or_else(missing)?,
                 SceneArray::Masks,
                 arguments.masks_full_scale,
             )
+            .named(arguments.masks_array.clone())
             .arranged(arguments.masks_axes, None)
             .part(
                 Part { crop: arguments.masks_crop, frames: arguments.masks_frames },
                 arguments.masks_packing,
-            ),
+            )
+            .dispersed(dispersion),
             measurement: Source::file(
                 named(&arguments.measurement).ok_or_else(missing)?,
                 SceneArray::Measurements,
-                arguments.measurement_full_scale,
+                arguments.full_scale,
             )
-            .arranged(arguments.measurement_axes, None)
-            .part(
-                Part { crop: arguments.measurement_crop, frames: None },
-                arguments.measurement_packing,
-            ),
+            .named(arguments.array.clone())
+            .arranged(arguments.axes, None)
+            .part(Part { crop: arguments.crop, frames: None }, arguments.packing),
             truth: named(&arguments.truth).map(|path| {
                 Source::file(path, SceneArray::Truth, arguments.truth_full_scale)
                     .arranged(arguments.truth_axes, None)
@@ -325,16 +352,22 @@ struct Input<'a> {
     truth: Option<(Array3<f32>, Channels)>,
     mosaic: Option<Mosaic>,
     findings: Vec<Finding>,
+    /// The registration of the masks, unless it is off.
+    registration: Option<Registered>,
 }
 
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let mut sources = Sources::new(arguments)?;
-        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())?;
+        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())
+            .map_err(|error| CliError::from(error).about(Role::Masks))?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
+        let dispersion = sources.masks.dispersion.clone();
+        let sensor = (height, width);
+        let frame_size = dispersion.as_ref().map_or(sensor, |bands| bands.frame_size(sensor));
         if let Some(truth) = &mut sources.truth {
-            truth.size = Some((height, width));
+            truth.size = Some(frame_size);
         }
         let Snapshots { first, last } = arguments.snapshots;
         let Arguments { dark, saturation, .. } = arguments;
@@ -342,20 +375,30 @@ impl<'a> Input<'a> {
         let behind =
             Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
         masks.array.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
-        let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))?;
+        let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))
+            .map_err(|error| CliError::from(error).about(Role::Measurement))?;
         let (measurement, snapshots) = (read.measurement, read.count);
         let (count, rows, columns) = measurement.array.dim();
+        if let Some(dispersion) = &dispersion
+            && (rows, columns) != (height, width)
+        {
+            return Err(CliError::Input(format!(
+                "measurement {} is {rows}x{columns} (rows x columns): {}",
+                sources.measurement.path.display(),
+                expected_size(dispersion, (height, width))
+            )));
+        }
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
                 "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
                  {height}x{width}; both must have the same height and width: state the window that they have in \
-                 common as --masks-crop or --measurement-crop",
+                 common as --masks-crop or --crop",
                 sources.measurement.path.display(),
                 sources.masks.path.display(),
             )));
         }
         let mosaic = arguments.mosaic;
-        let crops = [arguments.masks_crop, arguments.measurement_crop];
+        let crops = [arguments.masks_crop, arguments.crop];
         if mosaic.is_some() && !crops.into_iter().all(keeps_mosaic) {
             let text = "--mosaic: the window of a mosaic starts at an even row and an even column";
             return Err(CliError::Input(text.into()));
@@ -366,7 +409,7 @@ impl<'a> Input<'a> {
                  both: crop them so that they begin with the first pixel of a cell"
             )));
         }
-        let dim = masks.array.dim();
+        let dim = (frames, frame_size.0, frame_size.1);
         let truth = match &sources.truth {
             Some(source) => {
                 read_truth(source, dim, mosaic.is_some(), first..first + count, snapshots)?
@@ -375,7 +418,7 @@ impl<'a> Input<'a> {
         };
         let has_dark = !dark.is_empty();
         let arrays = (masks.array.view(), measurement.array.view());
-        let (calibration, judged) = judge(arrays, mosaic, has_dark)?;
+        let (calibration, judged) = judge(arrays, (mosaic, dispersion.as_ref()), has_dark)?;
         let judged = judged.into_iter().map(|finding| {
             // Findings count from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
@@ -383,13 +426,18 @@ impl<'a> Input<'a> {
         });
         let mut findings: Vec<Finding> = calibration.into_iter().collect();
         findings.extend(intake::combined(read.passed.findings, judged.collect()));
-        Ok(Self { sources, masks, measurement, first, truth, mosaic, findings })
+        Ok(Self { sources, masks, measurement, first, truth, mosaic, findings, registration: None })
     }
 
     fn shape(&self) -> SceneShape {
         let (frames, height, width) = self.masks.array.dim();
         let snapshots = self.measurement.array.dim().0 as u32;
         SceneShape { frames, height, width, snapshots, mosaic: self.mosaic }
+    }
+
+    /// Snapshots of a spectral camera are reconstructed one by one: their bands do not continue one another.
+    fn sequence(&self, stated: Sequence) -> Sequence {
+        if self.sources.masks.dispersion.is_some() { Sequence::Separate } else { stated }
     }
 
     /// Indices of the snapshots in the file.
@@ -400,6 +448,44 @@ impl<'a> Input<'a> {
     /// The solver's common scale of all snapshots, as in a job.
     fn white(&self) -> Result<f32> {
         Ok(white(self.masks.array.view(), self.measurement.array.view())?)
+    }
+
+    /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
+    /// known.
+    fn register(&mut self, request: RegistrationRequest, white: f32) -> Result<()> {
+        let masks = self.masks.array.view();
+        let is_coloured = self.mosaic.is_some() || self.sources.masks.dispersion.is_some();
+        if request.error(is_coloured).is_some() {
+            let text = "--registration: masks of a colour sensor or spectral camera are not moved; calibrate again";
+            return Err(CliError::Input(text.into()));
+        }
+        let light = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0));
+        let y = &self.measurement.array.index_axis(Axis(0), 0) / white;
+        let piece = |place: &Window| {
+            Ok(masks.slice(s![.., place.rows.clone(), place.columns.clone()]).to_owned())
+        };
+        let (light, y) = (light.view(), y.view());
+        let registered =
+            registration::register(request, is_coloured, light, y, piece, &mut |_| true)?;
+        if let Some(registered) = &registered {
+            let superseded = registered.superseded();
+            self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
+            self.findings.extend(registered.finding());
+        }
+        if let Some(shift) = registered.as_ref().and_then(Registered::applied_shift) {
+            let moved = registration::moved(masks, shift);
+            for mut snapshot in self.measurement.array.outer_iter_mut() {
+                let first = moved.index_axis(Axis(0), 0);
+                snapshot.zip_mut_with(&first, |y, mask| {
+                    if mask.is_nan() {
+                        *y = f32::NAN;
+                    }
+                });
+            }
+            self.masks.array = moved.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+        }
+        self.registration = registered;
+        Ok(())
     }
 
     fn recipe(
@@ -416,7 +502,9 @@ impl<'a> Input<'a> {
             algorithm: setup.algorithm,
             schedule: full_schedule(&setup.schedule, pilot.as_ref()),
             pilot,
+            registration: self.registration.clone(),
             shape: self.shape(),
+            dispersion: self.sources.masks.dispersion.clone(),
             inputs: Inputs {
                 masks_sha256: sha256(self.sources.masks.path)?,
                 masks_axes: self.masks.axes.map(|axes| axes.to_string()),
@@ -442,14 +530,16 @@ impl<'a> Input<'a> {
 /// findings on the snapshots. The checks read prepared files, so the arrays are written to temporary ones.
 fn judge(
     (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
-    mosaic: Option<Mosaic>,
+    (mosaic, dispersion): (Option<Mosaic>, Option<&Dispersion>),
     has_dark: bool,
 ) -> Result<(Option<Finding>, Vec<Finding>)> {
     let limits = Limits::default();
     let prepared = [prepare(masks)?, prepare(snapshots)?];
     let paths = (prepared[0].path(), prepared[1].path());
-    let report = intake::report(&planar::Reader::open(paths.0, &limits)?, &mut |_| true)?;
-    Ok((report.report.warning(), intake::judge(paths, mosaic, has_dark, &limits)?))
+    let masks = planar::Reader::open(paths.0, &limits)?;
+    let report = intake::report(&masks, dispersion.is_some(), &mut |_| true)?;
+    let judged = intake::judge(paths, (mosaic, dispersion), has_dark, &limits)?;
+    Ok((report.report.warning(), judged))
 }
 
 fn prepare(frames: ArrayView3<'_, f32>) -> Result<tempfile::NamedTempFile> {
@@ -523,7 +613,8 @@ impl Report {
         run: &RunRecord,
         quality: Option<Quality>,
     ) -> Self {
-        let (frames, height, width) = input.masks.dim();
+        let frames = input.masks.dim().0;
+        let SceneShape { height, width, .. } = recipe.shape.frame_shape(recipe.dispersion.as_ref());
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
         let summary = Summary::of(&tiles);

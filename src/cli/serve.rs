@@ -17,8 +17,10 @@ use super::supervisor::Supervisor;
 use crate::audit::AuditLog;
 #[cfg(feature = "nats")]
 use crate::config::{ClusterArguments, RemoteArguments, VERSION};
-use crate::config::{ConfigError, EngineArguments, ServeArguments, Takes, WorkerArguments};
-use crate::http::{App, Metrics, listen, router};
+use crate::config::{
+    ConfigError, DeviceState, EngineArguments, ServeArguments, Takes, WorkerArguments,
+};
+use crate::http::{App, Machine, Metrics, listen, router};
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
 use workers::nats::{
@@ -110,15 +112,22 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     #[cfg(not(feature = "nats"))]
     let trouble = None;
     let mut lines = vec![workers.clone(); settings.worker_count()];
-    // Clients wait for the checks of their uploads, so these must not wait for tiles.
-    let engine = EngineArguments { nice: 0, ..workers.engine.clone() };
+    // Clients wait for the checks of their uploads, so these must not wait for tiles. Short tasks need no GPU, and checks of
+    // users' networks run where these networks will.
+    let mut engine = EngineArguments { nice: 0, ..workers.engine.clone() };
+    if !engine.unconfined {
+        "cpu".clone_into(&mut engine.device);
+    }
     lines.push(WorkerArguments { takes: Takes::Light, engine, ..workers });
-    let supervisor = Supervisor::start(&store, &program, lines, &stop);
+    let (device, device_state) = watch::channel(DeviceState::Untried);
+    let supervisor = Supervisor::start(&store, &program, lines, &device, &stop);
     let closing = CancellationToken::new();
     let folded = metrics.clone();
     let maintenance =
         maintain(store.clone(), move || folded.upkeep(), settings.clone(), audit.clone());
     tokio::spawn(closing.clone().run_until_cancelled_owned(maintenance));
+    let webhooks = crate::webhooks::send(store.clone(), settings.webhook_hosts.clone());
+    tokio::spawn(closing.clone().run_until_cancelled_owned(webhooks));
     if settings.scrub_bytes > 0 {
         let (store, rate) = (store.clone(), settings.scrub_bytes);
         let scrub = async move { store.scrub(rate).await };
@@ -132,7 +141,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. Serve the API.
-    let app = App::new(store.clone(), (settings, audit), metrics, (trouble, confinement), closing);
+    let machine = Machine { cluster: trouble, confinement, device: device_state };
+    let app = App::new(store.clone(), (settings, audit), metrics, machine, closing);
     let service = router(app);
     tokio::select! {
         () = listen(listener, service, settings, stopped(stop.clone())) => {}
@@ -181,9 +191,7 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
         #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
         takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
-        // The driver of a GPU maps far more memory than it uses.
-        memory_bytes: (settings.engine.device == "cpu")
-            .then(|| allowance(settings.worker_memory_bytes)),
+        memory_bytes: Some(allowance(settings.worker_memory_bytes)),
         engine: settings.engine.clone(),
         log_format: settings.log_format,
         id: None,

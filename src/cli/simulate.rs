@@ -6,17 +6,17 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use ndarray::{Array2, Array3, ArrayView3, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use serde::Serialize;
 
 use super::CliError;
-use super::arguments::mosaic;
+use super::arguments::{DispersionArguments, mosaic};
 use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
 use crate::cli::error::Result;
 use engine::intake::{read_clip, read_colours};
 use formats::{Channels, npy};
-use optics::{Mosaic, OpticsError, illumination, measure, noisy};
+use optics::{Dispersion, Mosaic, OpticsError, illumination, measure, noisy};
 
 /// Simulate masks and measurements of a clip.
 #[derive(Debug, Args)]
@@ -28,6 +28,8 @@ pub struct Arguments {
     /// column, 3] or a folder of colour PNGs [default: a grey sensor].
     #[arg(long, value_name = "NAME", value_parser = mosaic())]
     mosaic: Option<Mosaic>,
+    #[command(flatten)]
+    dispersion: DispersionArguments,
     /// Value in the frames' file that means 1 [default: 255 for uint8 and .mat scenes, 65535 for
     /// uint16, 1 for floats].
     #[arg(long, value_name = "VALUE")]
@@ -68,6 +70,8 @@ struct Record {
     seed: u64,
     /// `None` for a grey sensor.
     mosaic: Option<Mosaic>,
+    /// Displacement of the bands, which are the frames of the scene; `None` for a video.
+    dispersion: Option<Dispersion>,
     compression_ratio: usize,
     snapshots: usize,
     height: usize,
@@ -121,11 +125,19 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let mut values = truth.slice_mut(s![.., .., channel..;channels.count().cast_signed()]);
         values *= &light;
     }
-    let simulated = arguments.masks.make(&optics, (ratio, height, width), arguments.seed)?;
+    let dispersion = arguments.spectral()?;
+    // One mask codes all bands.
+    let (frames, mask_size) = match &dispersion {
+        Some(bands) => (1, bands.mask_size((height, width))),
+        None => (ratio, (height, width)),
+    };
+    let size = (frames, mask_size.0, mask_size.1);
+    let simulated = arguments.masks.make(&optics, size, arguments.seed)?;
     let SimulatedMasks { masks, throughput, scale, apertures } = simulated;
-    let sensor_frames = match arguments.mosaic {
-        None => truth.clone(),
-        Some(mosaic) => {
+    let sensor_frames = match (arguments.mosaic, &dispersion) {
+        (None, None) => truth.clone(),
+        (None, Some(bands)) => on_sensor(&truth, |band, k| bands.shear(band, k % ratio))?,
+        (Some(mosaic), _) => {
             let mut sampled = Array3::zeros((used, height, width));
             for (mut frame, truth) in sampled.outer_iter_mut().zip(truth.outer_iter()) {
                 frame.assign(&mosaic.sample(truth, (0, 0)));
@@ -134,7 +146,16 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         }
     };
     let scene = sensor_frames.view();
-    let snapshots = measure_all(&masks, scene, arguments.noise_sigma / 255.0, arguments.seed)?;
+    let sheared = match &dispersion {
+        Some(bands) => {
+            let mask = masks.broadcast((ratio, mask_size.0, mask_size.1));
+            let mask = mask.ok_or_else(|| CliError::Failure("there is no mask".into()))?;
+            Some(on_sensor(&mask.to_owned(), |mask, k| bands.shear_mask(mask, k))?)
+        }
+        None => None,
+    };
+    let coding = sheared.as_ref().unwrap_or(&masks);
+    let snapshots = measure_all(coding, scene, arguments.noise_sigma / 255.0, arguments.seed)?;
     let mut record = Record {
         program_version: env!("CARGO_PKG_VERSION"),
         pattern: arguments.masks.pattern(),
@@ -142,6 +163,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         leak: arguments.masks.leak(),
         seed: arguments.seed,
         mosaic: arguments.mosaic,
+        dispersion,
         compression_ratio: ratio,
         snapshots: snapshots.len(),
         height,
@@ -172,6 +194,38 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     write(&arguments.out, &masks, &snapshots, (truth.view(), channels), &record)
 }
 
+impl Arguments {
+    /// The dispersion, if the scene is spectral.
+    fn spectral(&self) -> Result<Option<Dispersion>> {
+        let dispersion = self.dispersion.resolve()?;
+        let Some(bands) = &dispersion else { return Ok(None) };
+        let ratio = usize::from(self.compression_ratio);
+        let problem = if bands.bands() != ratio {
+            format!(
+                "there are {} offsets, but --compression-ratio {ratio}: state one offset for each band",
+                bands.bands()
+            )
+        } else if self.mosaic.is_some() || self.captures.is_some() {
+            "a spectral camera has a grey sensor and one mask: leave out --mosaic and --captures"
+                .to_owned()
+        } else {
+            return Ok(dispersion);
+        };
+        Err(CliError::Input(format!("--dispersion-offsets: {problem}")))
+    }
+}
+
+/// Displaces each image of a stack.
+fn on_sensor(
+    images: &Array3<f32>,
+    displace: impl Fn(ArrayView2<'_, f32>, usize) -> Array2<f32>,
+) -> Result<Array3<f32>> {
+    let displaced = images.outer_iter().enumerate().map(|(k, image)| displace(image, k));
+    let displaced: Vec<_> = displaced.collect();
+    let views: Vec<_> = displaced.iter().map(|image| image.view()).collect();
+    ndarray::stack(Axis(0), &views).map_err(|error| CliError::Failure(error.to_string()))
+}
+
 /// Simulates one measurement for each `B` frames of the truth.
 fn measure_all(
     masks: &Array3<f32>,
@@ -197,7 +251,10 @@ fn write(
     record: &Record,
 ) -> Result<()> {
     let failed = |error| CliError::file("write", out, &error);
-    npy::write_f32(&out.join("masks.npy"), masks.view())?;
+    match &record.dispersion {
+        Some(_) => npy::write_image_f32(&out.join("masks.npy"), masks.index_axis(Axis(0), 0))?,
+        None => npy::write_f32(&out.join("masks.npy"), masks.view())?,
+    }
     match channels {
         Channels::Grey => npy::write_f32(&out.join("truth.npy"), truth)?,
         Channels::Rgb => npy::write_colours(&out.join("truth.npy"), truth)?,

@@ -1,14 +1,20 @@
 //! The options of `submit` and `watch-folder`, and the requests that follow from them.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::CliError;
-use super::arguments::{Snapshots, axes, frame_range, mosaic, named_all, packing, sequence};
+use super::arguments::{
+    DispersionArguments, Snapshots, axes, frame_range, mosaic, named_all, packing, registration,
+    sequence,
+};
 use super::client::{Client, Result};
-use engine::job::{Algorithm, CalibrationId, Mosaic, Sequence, Sha256};
+use super::fields::Role;
+use engine::job::{
+    Algorithm, CalibrationId, Dispersion, Mosaic, RegistrationRequest, Sequence, Sha256,
+};
 use formats::{Axes, Crop, Packing};
 
 /// Options of the calibration, the measurement and the job.
@@ -20,7 +26,7 @@ pub(super) struct SubmissionArguments {
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
-    /// Name of the masks in an npz, .mat or HDF5 file [default: mask].
+    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_array: Option<String>,
     /// The order of the axes of the masks [default: the only one that fits].
@@ -48,10 +54,12 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
           help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
+    #[command(flatten, next_help_heading = CALIBRATION)]
+    dispersion: DispersionArguments,
     /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     bad_pixels: Option<PathBuf>,
-    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas].
+    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
     #[arg(long, value_name = "NAME", help_heading = MEASUREMENT)]
     array: Option<String>,
     /// The order of the axes of the snapshots [default: the only one that fits].
@@ -104,12 +112,22 @@ pub(super) struct SubmissionArguments {
     /// Least overlap of neighbouring tiles in pixels.
     #[arg(long, value_name = "PIXELS", requires = "tile", help_heading = JOB)]
     overlap: Option<u32>,
+    /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
+    /// it in pixels [default: auto].
+    #[arg(long, value_name = "WHICH", value_parser = registration, allow_hyphen_values = true, help_heading = JOB)]
+    registration: Option<RegistrationRequest>,
     /// From -100 to 100; jobs of higher priority are served first.
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, help_heading = JOB)]
     priority: i32,
+    /// True frames [frame, row, column] of this snapshot, or of all. PSNR and SSIM are relative to them.
+    #[arg(long, value_name = "FILE", help_heading = JOB)]
+    truth: Option<PathBuf>,
     /// Label of the job [default: none; of watch-folder: the name of the file].
     #[arg(long, value_name = "TEXT", help_heading = JOB)]
     label: Option<String>,
+    /// Address that is notified when the job ends; the administrator allows its host [default: none].
+    #[arg(long, value_name = "URL", help_heading = JOB)]
+    webhook: Option<String>,
 }
 
 const CALIBRATION: &str = "Calibration";
@@ -124,26 +142,33 @@ pub(super) struct Recipe {
 }
 
 impl SubmissionArguments {
-    /// Files that belong to each snapshot: the masks, the map of bad pixels and the dark captures.
+    /// Files that belong to each snapshot: the masks, the map of bad pixels, the dark captures and the true frames.
     pub(super) fn own_files(&self) -> impl Iterator<Item = &PathBuf> {
-        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark)
+        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark).chain(&self.truth)
     }
 
-    /// Uploads masks and dark captures, creates the calibration if necessary, and returns the requests.
+    /// Uploads masks, dark captures and true frames, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
+        let dispersion = self.dispersion.resolve()?;
         let calibration = match (&self.calibration, &self.masks) {
+            (Some(_), _) if dispersion.is_some() => {
+                let text =
+                    "--dispersion-offsets belongs to --masks: a calibration has its own dispersion";
+                return Err(CliError::Input(text.into()).into());
+            }
             (Some(id), _) => id.to_string(),
             (None, Some(masks)) => {
                 let bad_pixels = match &self.bad_pixels {
                     Some(map) => Some(client.upload_with_bar(map).await?),
                     None => None,
                 };
-                let body =
-                    self.calibration_request(client.upload_with_bar(masks).await?, bad_pixels);
+                let sent = client.upload_with_bar(masks).await?;
+                let body = self.calibration_request(sent, bad_pixels, dispersion);
                 // One file of masks creates one calibration for all clients.
                 let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-                client.create_checked("/v1/calibrations", &body, &key).await?
+                let created = client.create_checked("/v1/calibrations", &body, &key).await;
+                created.map_err(|error| error.about(Role::Masks, masks))?
             }
             (None, None) => {
                 let text = "give --masks FILE or --calibration ID";
@@ -151,8 +176,12 @@ impl SubmissionArguments {
             }
         };
         let dark = self.send_dark(client).await?;
+        let truth = match &self.truth {
+            Some(frames) => Some(client.upload_with_bar(frames).await?),
+            None => None,
+        };
         let measurement = self.measurement_request(&calibration, &dark);
-        Ok(Recipe { measurement, job: self.job_request(schedule) })
+        Ok(Recipe { measurement, job: self.job_request(schedule, truth) })
     }
 
     /// Uploads the dark captures that the service does not have, or has deleted as unused.
@@ -164,7 +193,12 @@ impl SubmissionArguments {
         Ok(sent)
     }
 
-    fn calibration_request(&self, masks: Sha256, bad_pixels: Option<Sha256>) -> Value {
+    fn calibration_request(
+        &self,
+        masks: Sha256,
+        bad_pixels: Option<Sha256>,
+        dispersion: Option<Dispersion>,
+    ) -> Value {
         let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
         add(&mut body, "array", json!(self.masks_array));
         add(&mut body, "axes", json!(self.masks_axes));
@@ -173,6 +207,7 @@ impl SubmissionArguments {
         add(&mut body, "packing", json!(self.masks_packing));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         add(&mut body, "mosaic", json!(self.mosaic));
+        add(&mut body, "dispersion", json!(dispersion));
         add(&mut body, "bad_pixels", json!(bad_pixels));
         add(&mut body, "name", json!(self.masks_name));
         Value::Object(body)
@@ -196,7 +231,7 @@ impl SubmissionArguments {
     }
 
     /// A request for a job, without its measurement.
-    fn job_request(&self, schedule: Value) -> Map<String, Value> {
+    fn job_request(&self, schedule: Value, truth: Option<Sha256>) -> Map<String, Value> {
         let tile = self.tile.zip(self.overlap);
         let tile = tile.map(|(size, overlap)| json!({"size": size, "overlap": overlap}));
         let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.into_str()))]);
@@ -205,8 +240,11 @@ impl SubmissionArguments {
         add(&mut body, "snapshots", self.snapshots.request());
         add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
         add(&mut body, "tile", json!(tile));
+        add(&mut body, "registration", json!(self.registration));
         add(&mut body, "priority", json!(self.priority));
+        add(&mut body, "truth", json!(truth));
         add(&mut body, "label", json!(self.label));
+        add(&mut body, "webhook", json!(self.webhook));
         body
     }
 
@@ -227,18 +265,19 @@ fn add(request: &mut Map<String, Value>, name: &str, value: Value) {
 }
 
 impl Recipe {
-    /// Creates a measurement and a job from uploaded data. `label` is the default label. The same key returns the same job.
+    /// Creates a measurement and a job from a file that was uploaded. `label` is the default label. The same key returns the same job.
     pub(super) async fn submit(
         &self,
         client: &Client,
-        data: Sha256,
+        (file, data): (&Path, Sha256),
         label: Option<&str>,
         key: &str,
     ) -> Result<Value> {
         let mut measurement = self.measurement.clone();
         measurement.insert("data".to_owned(), json!(data));
         let body = Value::Object(measurement);
-        let measurement = client.create_checked("/v1/measurements", &body, key).await?;
+        let created = client.create_checked("/v1/measurements", &body, key).await;
+        let measurement = created.map_err(|error| error.about(Role::Measurement, file))?;
         let mut job = self.job.clone();
         job.insert("measurement".to_owned(), json!(measurement));
         if !job.contains_key("label") {
@@ -295,6 +334,10 @@ mod tests {
             ("masks-full-scale", "255"),
             ("masks-name", "May"),
             ("mosaic", "rggb"),
+            ("dispersion-offsets", "0:2:8"),
+            ("dispersion-axis", "row"),
+            ("dispersion-wavelengths", "450:10:8"),
+            ("dispersion-mask", "measurement"),
             ("bad-pixels", "b.npy"),
             ("array", "meas"),
             ("axes", "row-column-frame"),
@@ -313,8 +356,11 @@ mod tests {
             ("snapshots", "0-3"),
             ("tile", "128"),
             ("overlap", "16"),
+            ("registration", "-0.5,2"),
             ("priority", "-3"),
+            ("truth", "t.npy"),
             ("label", "milk"),
+            ("webhook", "https://lab.example/hook"),
         ];
         let mut known: BTreeSet<&str> = values.iter().map(|(name, _)| *name).collect();
         // It replaces the options of masks.
@@ -329,16 +375,18 @@ mod tests {
         let arguments = SubmissionArguments::from_arg_matches(&matches).unwrap();
 
         let sha256 = Sha256::of(b"file");
-        let calibration = arguments.calibration_request(sha256, Some(sha256));
+        let dispersion = arguments.dispersion.resolve().unwrap();
+        let calibration = arguments.calibration_request(sha256, Some(sha256), dispersion);
         // Captures of many files are for `calibrate`, the dashboard and the client libraries.
         let expected = properties("CalibrationRequest", &["captures"]);
         assert_eq!(names(calibration.as_object().unwrap()), expected);
         let measurement = arguments.measurement_request("id", &[sha256]);
         assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
-        let job = arguments.job_request(arguments.schedule().unwrap());
+        let job = arguments.job_request(arguments.schedule().unwrap(), Some(sha256));
         // The measurement names the calibration.
         assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
         assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));
+        assert_eq!(job["registration"], serde_json::json!({"shift": [-0.5, 2.0]}));
     }
 
     #[test]

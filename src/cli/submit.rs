@@ -38,7 +38,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let recipe = arguments.submission.recipe(&client).await?;
         let data = client.upload_with_bar(&arguments.measurement).await?;
         let key = arguments.key.clone().unwrap_or_else(|| Uuid::now_v7().to_string());
-        let job = recipe.submit(&client, data, None, &key).await?;
+        let job = recipe.submit(&client, (&arguments.measurement, data), None, &key).await?;
         if arguments.json {
             print_line(&job)?;
         }
@@ -47,6 +47,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             print_line(&job.id)?;
             verdict::lines(&job.warnings).iter().for_each(|line| eprintln!("{line}"));
         }
-        verdict::refuse_errors([&*job.warnings])
+        verdict::refuse_bad([(&*job.warnings, None)])
     })
 }

@@ -9,11 +9,12 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use tokio::process::{Child, Command};
+use tokio::io::{AsyncBufReadExt, BufReader};
+use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use crate::config::WorkerArguments;
+use crate::config::{DEVICE_LOST, DeviceState, Takes, WorkerArguments};
 use engine::job::WorkerId;
 use engine::pipeline::usage::{kills_for_memory, peak_rss_of};
 use store::{Store, WorkerEnd};
@@ -29,6 +30,10 @@ const MEMORY_POLL: Duration = Duration::from_millis(500);
 const SIGN_POLL: Duration = Duration::from_secs(5);
 /// A worker without a sign of life for this long hangs; the lease of its task has expired.
 const MAX_SILENCE: Duration = Duration::from_secs(30);
+/// Line that a worker prints once its device has passed the test.
+const DEVICE_READY: &str = "device ready";
+/// Start of the line with which a worker refuses its device. The reason follows.
+const DEVICE_REFUSED: &str = "device refused: ";
 /// A worker that has lived this long has started correctly.
 pub(super) const HEALTHY: Duration = Duration::from_secs(20);
 
@@ -37,11 +42,13 @@ pub(super) struct Supervisor {
 }
 
 impl Supervisor {
-    /// Starts one worker for each element of `workers`. They end when `stop` becomes true.
+    /// Starts one worker for each element of `workers`. They end when `stop` becomes true. `device` receives the state
+    /// of the device of workers that take more than short tasks.
     pub(super) fn start(
         store: &Store,
         program: &Path,
         workers: Vec<WorkerArguments>,
+        device: &watch::Sender<DeviceState>,
         stop: &watch::Receiver<bool>,
     ) -> Self {
         let mut slots = JoinSet::new();
@@ -49,6 +56,7 @@ impl Supervisor {
             let slot = Slot {
                 store: store.clone(),
                 program: program.to_owned(),
+                device: (arguments.takes != Takes::Light).then(|| device.clone()),
                 arguments,
                 stop: stop.clone(),
             };
@@ -67,6 +75,7 @@ struct Slot {
     store: Store,
     program: PathBuf,
     arguments: WorkerArguments,
+    device: Option<watch::Sender<DeviceState>>,
     stop: watch::Receiver<bool>,
 }
 
@@ -100,7 +109,7 @@ impl Slot {
         command
             .args(arguments.command_line())
             .stdin(Stdio::piped())
-            .stdout(Stdio::null())
+            .stdout(Stdio::piped())
             // Ctrl-C in the terminal must reach only the server, which then stops the workers.
             .process_group(0)
             .kill_on_drop(true)
@@ -109,6 +118,9 @@ impl Slot {
 
     async fn watch(&mut self, id: WorkerId, mut child: Child) {
         let stdin = child.stdin.take();
+        if let Some(output) = child.stdout.take() {
+            tokio::spawn(read_state(output, self.device.clone()));
+        }
         let store = self.store.clone();
         let mut memory = Memory::of(child.id());
         let ended = tokio::select! {
@@ -121,7 +133,7 @@ impl Slot {
             never = memory.watch() => match never {},
         };
         let end = match ended {
-            Some(Ok(status)) => memory.explain(judge(status), self.arguments.memory_bytes),
+            Some(Ok(status)) => memory.explain(judge(status), self.arguments.memory_limit()),
             Some(Err(error)) => WorkerEnd::Crashed(error.to_string()),
             None => {
                 drop(stdin);
@@ -137,6 +149,7 @@ impl Slot {
         let reason = match end {
             WorkerEnd::Left => "left",
             WorkerEnd::Killed => "killed",
+            WorkerEnd::DeviceLost => "device_lost",
             WorkerEnd::Starved(_) => "starved",
             WorkerEnd::Crashed(_) => "crashed",
         };
@@ -144,12 +157,36 @@ impl Slot {
         match end {
             WorkerEnd::Left => tracing::info!(worker = %id, "a worker has ended"),
             WorkerEnd::Killed => tracing::warn!(worker = %id, "a worker was killed"),
+            WorkerEnd::DeviceLost => tracing::error!(worker = %id, "a worker has lost its GPU"),
             WorkerEnd::Starved(how) => tracing::error!(worker = %id, how, "a worker had no memory"),
             WorkerEnd::Crashed(how) => tracing::error!(worker = %id, how, "a worker has died"),
         }
         if let Err(error) = self.store.worker_ended(id, end).await {
             // The task is freed when its lease expires.
             tracing::error!(worker = %id, %error, "the task of a worker can't be freed");
+        }
+    }
+}
+
+/// The line that reports whether a worker can use its device, for [`read_state`].
+pub(super) fn device_line(tried: Result<(), &str>) -> String {
+    match tried {
+        Ok(()) => DEVICE_READY.to_owned(),
+        Err(reason) => format!("{DEVICE_REFUSED}{}", reason.replace('\n', " ")),
+    }
+}
+
+/// Reads what a worker prints until it ends, and passes on the state of its device.
+async fn read_state(output: ChildStdout, device: Option<watch::Sender<DeviceState>>) {
+    let mut lines = BufReader::new(output).lines();
+    while let Ok(Some(line)) = lines.next_line().await {
+        let state = match line.strip_prefix(DEVICE_REFUSED) {
+            Some(reason) => DeviceState::Refused(reason.to_owned()),
+            None if line == DEVICE_READY => DeviceState::Ready,
+            None => continue,
+        };
+        if let Some(device) = &device {
+            device.send_replace(state);
         }
     }
 }
@@ -234,6 +271,7 @@ pub(super) fn judge(status: ExitStatus) -> WorkerEnd {
     const SIGTERM: i32 = 15;
     match (status.code(), status.signal()) {
         (Some(0), _) => WorkerEnd::Left,
+        (Some(code), _) if code == i32::from(DEVICE_LOST) => WorkerEnd::DeviceLost,
         (_, Some(SIGINT | SIGKILL | SIGTERM)) => WorkerEnd::Killed,
         _ => WorkerEnd::Crashed(status.to_string()),
     }
@@ -247,6 +285,7 @@ mod tests {
     fn a_crash_counts_against_the_task_and_a_kill_does_not() {
         assert!(matches!(judge(ExitStatus::from_raw(0)), WorkerEnd::Left));
         assert!(matches!(judge(ExitStatus::from_raw(9)), WorkerEnd::Killed));
+        assert!(matches!(judge(ExitStatus::from_raw(75 << 8)), WorkerEnd::DeviceLost));
         for fault in [11, 6, 4, 101 << 8] {
             let end = judge(ExitStatus::from_raw(fault));
             assert!(matches!(end, WorkerEnd::Crashed(_)), "{fault}: {end:?}");

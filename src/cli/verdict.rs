@@ -1,11 +1,13 @@
 //! Formats findings and verdicts for all commands.
 
+use std::collections::BTreeSet;
 use std::fmt::Write;
 
 use super::CliError;
 use super::client::Job;
 use super::error::Result;
-use engine::job::{Assessment, Finding, JobState, Severity};
+use super::fields::{as_options, role_of};
+use engine::job::{Assessment, Finding, Grade, JobState, Severity};
 
 /// Snapshots after the first that the line of a finding lists. Further ones are counted.
 const NAMED_SNAPSHOTS: usize = 8;
@@ -42,7 +44,9 @@ fn line(finding: &Finding, snapshots: &[u32]) -> String {
             prefix = format!("snapshots {first}, {}{further}: ", named.join(", "));
         }
     }
-    let Finding { code, detail, remedy, .. } = finding;
+    let Finding { code, .. } = finding;
+    let role = role_of(code);
+    let (detail, remedy) = (as_options(&finding.detail, role), as_options(&finding.remedy, role));
     let (detail, remedy) = (detail.trim_end_matches('.'), remedy.trim_end_matches('.'));
     format!("{severity} {code}: {prefix}{detail}. Remedy: {remedy}.")
 }
@@ -64,7 +68,7 @@ pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> 
                 (None, ..) => format!("{grade}, no expected PSNR"),
             }
         }
-        None if errors(findings) > 0 => "bad".to_owned(),
+        None if !errors(findings).is_empty() => "bad".to_owned(),
         None => "not assessed".to_owned(),
     }
 }
@@ -80,19 +84,29 @@ pub(super) fn merge(checks: &[Finding], assessment: Option<&Assessment>) -> Vec<
     findings
 }
 
-fn errors(findings: &[Finding]) -> usize {
-    findings.iter().filter(|finding| finding.severity == Severity::Error).count()
+/// The codes of the errors among findings. The same error of several snapshots counts once.
+fn errors(findings: &[Finding]) -> BTreeSet<&str> {
+    let errors = findings.iter().filter(|finding| finding.severity == Severity::Error);
+    errors.map(|finding| finding.code.as_str()).collect()
 }
 
-/// Returns the error for exit code 3 if the checks found errors.
-pub(super) fn refuse_errors<'a>(findings: impl IntoIterator<Item = &'a [Finding]>) -> Result<()> {
-    let count: usize = findings.into_iter().map(errors).sum();
-    match count {
-        0 => Ok(()),
-        1 => Err(CliError::ErrorsFound("the checks found an error: results will be wrong".into())),
-        _ => Err(CliError::ErrorsFound(format!(
-            "the checks found {count} errors: results will be wrong"
-        ))),
+/// Returns the error for exit code 3 if the checks of a result found errors, or if its grade is bad.
+pub(super) fn refuse_bad<'a>(
+    results: impl IntoIterator<Item = (&'a [Finding], Option<&'a Assessment>)>,
+) -> Result<()> {
+    let (mut codes, mut is_bad) = (BTreeSet::new(), false);
+    for (findings, assessment) in results {
+        codes.extend(errors(findings));
+        is_bad |= assessment.is_some_and(|assessment| assessment.grade == Grade::Bad);
+    }
+    let codes: Vec<&str> = codes.into_iter().collect();
+    match codes.as_slice() {
+        [] if is_bad => Err(CliError::ErrorsFound("the verdict is bad".into())),
+        [] => Ok(()),
+        _ => {
+            let text = format!("the checks found {}: results will be wrong", codes.join(", "));
+            Err(CliError::ErrorsFound(text))
+        }
     }
 }
 
@@ -118,7 +132,7 @@ impl Job {
 
 #[cfg(test)]
 mod tests {
-    use super::{lines, refuse_errors, verdict};
+    use super::{lines, refuse_bad, verdict};
     use engine::job::{Assessment, Finding, Grade, Severity};
 
     fn finding(code: &str, severity: Severity, snapshot: Option<u32>) -> Finding {
@@ -147,9 +161,9 @@ mod tests {
             [finding("a", Severity::Warning, None)],
             [finding("b", Severity::Error, None), finding("c", Severity::Error, None)],
         );
-        assert!(refuse_errors([&warning[..]]).is_ok());
-        let refused = refuse_errors([&warning[..], &error]).unwrap_err();
-        assert!(refused.to_string().contains("2 errors"), "{refused}");
+        assert!(refuse_bad([(&warning[..], None)]).is_ok());
+        let refused = refuse_bad([(&warning[..], None), (&error, None)]).unwrap_err();
+        assert!(refused.to_string().contains("found b, c:"), "{refused}");
         assert_eq!(
             format!("{:?}", refused.exit_code()),
             format!("{:?}", std::process::ExitCode::from(3))

@@ -7,6 +7,7 @@ use serde_json::json;
 use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
+use super::exec::{End, ExecArguments};
 use super::output::print_line;
 use super::progress;
 use super::verdict;
@@ -23,6 +24,8 @@ pub struct Arguments {
     jobs: Vec<JobId>,
     #[command(flatten)]
     service: ServiceArguments,
+    #[command(flatten)]
+    exec: ExecArguments,
     /// Print a JSON object for each job.
     #[arg(long)]
     json: bool,
@@ -50,6 +53,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
                 let job = client.job(id, wait).await?;
                 progress::show(bar, job.progress.percent / 100.0);
                 if job.state.is_final() {
+                    arguments.exec.run(&End::of(&job), None).await?;
                     return Ok::<Job, CliError>(job);
                 }
                 // The service answers at once if too many requests of the lab wait.
@@ -79,5 +83,6 @@ fn report(jobs: &[Job], as_json: bool) -> Result<()> {
         return Err(CliError::Failure(failures.join("; ")));
     }
     let findings: Vec<_> = jobs.iter().map(Job::findings).collect();
-    verdict::refuse_errors(findings.iter().map(Vec::as_slice))
+    let assessments = jobs.iter().map(|job| job.assessment.as_ref());
+    verdict::refuse_bad(findings.iter().map(Vec::as_slice).zip(assessments))
 }

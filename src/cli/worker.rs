@@ -10,6 +10,8 @@ use tokio_util::sync::CancellationToken;
 use super::confine::{confine_worker, folders_of, limit_memory};
 #[cfg(feature = "nats")]
 use super::guard::guard;
+use super::output::print_line;
+use super::supervisor::device_line;
 use super::{CliError, logging};
 use crate::cli::error::Result;
 #[cfg(feature = "nats")]
@@ -27,7 +29,7 @@ use workers::{Local, ModelCommand, Worker, WorkerError};
 pub fn run(settings: &WorkerArguments) -> Result<()> {
     logging::start(settings.log_format);
     lower_priority(settings.engine.nice)?;
-    if let Some(bytes) = settings.memory_bytes {
+    if let Some(bytes) = settings.memory_limit() {
         limit_memory(bytes).map_err(CliError::Failure)?;
     }
     // The driver of a GPU needs files that can't be listed.
@@ -53,6 +55,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     if settings.remote.nats.is_wanted() && !settings.supervised {
         return runtime.block_on(guard(&settings.remote.cache_folder(), terminated()));
     }
+    try_device(&network, settings)?;
     let ended = runtime.block_on(async {
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
@@ -64,12 +67,25 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
             #[cfg(feature = "nats")]
             Err(WorkEnd::Cluster(error)) => Err(error.into()),
             Err(WorkEnd::Store(error)) => Err(error.into()),
+            Err(WorkEnd::Worker(WorkerError::DeviceLost(reason))) => {
+                Err(CliError::DeviceLost(reason))
+            }
             ended => ended.map_err(|error| failed(&error)),
         }
     });
     // The computing thread may still run or hang, so it is not awaited.
     runtime.shutdown_background();
     ended
+}
+
+/// Refuses to start with a device that can't run a network. A supervised worker reports the outcome to its server.
+fn try_device(network: &NetworkSource, settings: &WorkerArguments) -> Result<()> {
+    let tried = network.try_device().map_err(|error| error.to_string());
+    if settings.supervised && settings.data_folder().is_some() {
+        print_line(device_line(tried.as_ref().copied().map_err(String::as_str)))?;
+    }
+    // Wrong settings: a restart does not help.
+    tried.map_err(CliError::Input)
 }
 
 /// Error that ended the work.
@@ -103,7 +119,8 @@ async fn work(
         return Ok(ended?);
     }
     let store = Store::open(settings.data_folder().unwrap_or(Path::new("")), Purpose::Use).await?;
-    let local = Local::new(store.clone(), id, settings.takes.into());
+    let local =
+        Local::new(store.clone(), id, settings.takes.into(), settings.engine.device.clone());
     let ended = Worker::new(local, network, model, stall, stop).run().await;
     store.close().await;
     Ok(ended?)
@@ -129,7 +146,9 @@ fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
 /// The command lines for processes of users' networks, with the limits of this worker.
 fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     let WorkerArguments { memory_bytes, engine, .. } = settings;
-    let mut options = vec!["--device".into(), engine.device.clone().into()];
+    // A driver needs files that can't be listed, so networks of users run on the CPU unless they may be unconfined.
+    let device = if engine.unconfined { engine.device.as_str() } else { "cpu" };
+    let mut options = vec!["--device".into(), device.into()];
     if let Some(library) = &engine.onnxruntime {
         options.extend(["--onnxruntime".into(), library.into()]);
     }
@@ -141,7 +160,8 @@ fn model_command(settings: &WorkerArguments, program: PathBuf) -> ModelCommand {
     }
     let line = |command: &str| [&[command.into()], &options[..]].concat();
     let (run, check) = (line("run-model"), line("check-model"));
-    ModelCommand { program, run, check, memory_bytes: *memory_bytes }
+    let provider = Device::parse(device).map_or("unknown", Device::provider);
+    ModelCommand { program, run, check, memory_bytes: *memory_bytes, provider }
 }
 
 /// Lowers the priority of this process and its threads. A priority that is already lower remains, because only root may

@@ -83,10 +83,10 @@ impl Admission {
 
     /// Takes one of the places for uploads.
     pub(super) fn place(&self, lab: &Lab) -> Result<Place> {
-        self.places.take(lab).ok_or_else(|| {
+        self.places.take(lab).map_err(|full| {
             let detail =
                 "all places for uploads are taken, or this lab has its share; try again soon";
-            ApiError::new(Code::TooManyUploads, detail)
+            ApiError::new(Code::TooManyUploads, detail).retry_after(full.seconds)
         })
     }
 

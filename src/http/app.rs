@@ -17,7 +17,7 @@ use super::rendering::Pictures;
 use super::revocation::Revocations;
 use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
-use crate::config::ServeArguments;
+use crate::config::{DeviceState, ServeArguments};
 use engine::job::{Timestamp, TokenId, without_paths};
 use formats::Limits;
 use store::Store;
@@ -55,24 +55,27 @@ pub struct Services {
     /// The rate at which each token begins sessions.
     pub(super) session_rates: Rates<TokenId>,
     pub(super) pictures: Pictures,
-    /// Why no tile can leave this machine, where tiles should.
-    pub(super) cluster: Option<watch::Receiver<Option<String>>>,
+    pub(super) machine: Machine,
+}
+
+/// The state of the cluster, the confinement and the device of the workers.
+#[derive(Debug)]
+pub struct Machine {
+    /// Why no tile can leave this machine; `None` if none should.
+    pub cluster: Option<watch::Receiver<Option<String>>>,
     /// Why networks of users can read files of labs, if they can.
-    pub(super) confinement: std::result::Result<(), String>,
+    pub confinement: std::result::Result<(), String>,
+    /// State of the device that runs networks.
+    pub device: watch::Receiver<DeviceState>,
 }
 
 impl App {
-    /// The app on a store, with these settings. `cluster` tells why no tile can leave this machine, none if
-    /// none should; `confinement` why networks of users can read files of labs, if they can. Answers that
-    /// have no end of their own end with `closing`. Needs a runtime of tokio.
+    /// The app on a store, with these settings. Endless answers end with `closing`. Needs a runtime of tokio.
     pub fn new(
         store: Store,
         (settings, audit): (&ServeArguments, AuditLog),
         metrics: Metrics,
-        (cluster, confinement): (
-            Option<watch::Receiver<Option<String>>>,
-            std::result::Result<(), String>,
-        ),
+        machine: Machine,
         closing: CancellationToken,
     ) -> Self {
         Self(Arc::new(Services {
@@ -88,8 +91,7 @@ impl App {
             closing,
             disk_tried: Mutex::default(),
             metrics,
-            cluster,
-            confinement,
+            machine,
             settings: settings.clone(),
             audit,
             store,
@@ -111,7 +113,11 @@ impl App {
         let elsewhere = self.settings.without_tiles() || self.settings.workers == Some(0);
         // Workers that others start bring their own.
         let found = if elsewhere { Ok(()) } else { self.settings.engine.check_library() };
-        found.map_err(|error| without_paths(&error.to_string()))
+        found.map_err(|error| without_paths(&error.to_string()))?;
+        match &*self.machine.device.borrow() {
+            DeviceState::Refused(reason) => Err(without_paths(reason)),
+            DeviceState::Untried | DeviceState::Ready => Ok(()),
+        }
     }
 }
 
@@ -144,7 +150,7 @@ impl App {
 
     /// What keeps the service from doing some jobs: networks, the cluster, workers for tiles.
     pub(super) async fn troubles(&self) -> Result<Vec<String>> {
-        let cluster = self.cluster.as_ref().and_then(|trouble| trouble.borrow().clone());
+        let cluster = self.machine.cluster.as_ref().and_then(|trouble| trouble.borrow().clone());
         let troubles = [self.networks().err(), cluster, self.tiles().await?.err()];
         Ok(troubles.into_iter().flatten().collect())
     }

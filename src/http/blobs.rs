@@ -129,7 +129,6 @@ pub(super) async fn content(
     let open = app.store.open_blob(sha256);
     let mut response = download.send(open, (&method, &headers)).await?;
     let fields = response.headers_mut();
-    fields.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     fields.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static("sandbox"));
     Ok(response)
 }

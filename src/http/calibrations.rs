@@ -11,7 +11,8 @@ use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody, Renaming};
 use super::submissions::{PATIENCE, Stage, make, pending};
 use engine::job::{
-    CalibrationId, CalibrationRequest, Lab, Label, Mosaic, Reading, Sha256, Submission, Timestamp,
+    CalibrationId, CalibrationRequest, Dispersion, Lab, Label, Mosaic, Reading, Sha256, Submission,
+    Timestamp,
 };
 use store::{Asked, Calibration, Filter, Made, Page, Request, Span};
 
@@ -61,6 +62,8 @@ pub(super) struct CalibrationBody {
     clipped_negatives: Option<u64>,
     /// Colours of the pixels of the sensor; null for a grey sensor.
     mosaic: Option<Mosaic>,
+    /// Displacement of the bands of a spectral camera; null for other cameras. Height and width are those of the measurement.
+    dispersion: Option<Dispersion>,
     reading: Option<Reading>,
 }
 
@@ -87,6 +90,7 @@ impl From<Calibration> for CalibrationBody {
             dead_pixels: Some(facts.dead_pixels),
             clipped_negatives: Some(facts.clipped_negatives),
             mosaic: facts.mosaic,
+            dispersion: facts.dispersion,
             reading: facts.reading,
         }
     }
@@ -95,11 +99,15 @@ impl From<Calibration> for CalibrationBody {
 impl From<Request> for CalibrationBody {
     fn from(request: Request) -> Self {
         let (state, error, problem) = pending(&request);
-        let (frames, mosaic) = match &request.submission {
-            Submission::Calibration(CalibrationRequest { captures, mosaic, .. }) => {
-                (captures.as_ref().map(|captures| captures.masks.len()), *mosaic)
-            }
-            Submission::Measurement(_) | Submission::Model(_) => (None, None),
+        let (frames, mosaic, dispersion) = match &request.submission {
+            Submission::Calibration(CalibrationRequest {
+                captures, mosaic, dispersion, ..
+            }) => (
+                captures.as_ref().map(|captures| captures.masks.len()),
+                *mosaic,
+                dispersion.clone(),
+            ),
+            Submission::Measurement(_) | Submission::Model(_) => (None, None, None),
         };
         Self {
             id: request.id.into(),
@@ -121,6 +129,7 @@ impl From<Request> for CalibrationBody {
             dead_pixels: None,
             clipped_negatives: None,
             mosaic,
+            dispersion,
             reading: None,
         }
     }

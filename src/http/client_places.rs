@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
+use std::time::Instant;
 
 use axum::body::{Body, Bytes, HttpBody};
 use axum::extract::{Request, State};
@@ -14,6 +15,7 @@ use hyper::body::{Frame, SizeHint};
 
 use super::client::Client;
 use super::error::{ApiError, Code};
+use super::turnover::Turnover;
 
 /// Places of one address at most, also if there are very many.
 const MOST_OF_AN_ADDRESS: usize = 2048;
@@ -23,7 +25,13 @@ const MOST_OF_AN_ADDRESS: usize = 2048;
 pub(super) struct Places {
     most: usize,
     per_address: usize,
-    taken: Arc<Mutex<HashMap<IpAddr, usize>>>,
+    taken: Arc<Mutex<Taken>>,
+}
+
+#[derive(Debug, Default)]
+struct Taken {
+    by_network: HashMap<IpAddr, usize>,
+    turnover: Turnover,
 }
 
 /// A place, until it is dropped.
@@ -31,6 +39,7 @@ pub(super) struct Places {
 pub(super) struct Place {
     places: Places,
     network: IpAddr,
+    since: Instant,
 }
 
 impl Places {
@@ -49,26 +58,34 @@ impl Places {
         self.take_within(address, usize::MAX)
     }
 
+    /// Estimated seconds until a place of this address is free.
+    fn next_end(&self, address: IpAddr) -> u64 {
+        let taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
+        let held = taken.by_network.get(&Client::network(address)).copied().unwrap_or(0);
+        taken.turnover.next_end(held)
+    }
+
     fn take_within(&self, address: IpAddr, limit: usize) -> Option<Place> {
         let network = Client::network(address);
         let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        let all: usize = taken.values().sum();
-        let own = taken.get(&network).copied().unwrap_or(0);
+        let all: usize = taken.by_network.values().sum();
+        let own = taken.by_network.get(&network).copied().unwrap_or(0);
         if all >= self.most || own >= limit {
             return None;
         }
-        taken.insert(network, own + 1);
-        Some(Place { places: self.clone(), network })
+        taken.by_network.insert(network, own + 1);
+        Some(Place { places: self.clone(), network, since: Instant::now() })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
         let mut taken = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(own) = taken.get_mut(&self.network) {
+        taken.turnover.record(self.since.elapsed());
+        if let Some(own) = taken.by_network.get_mut(&self.network) {
             *own -= 1;
             if *own == 0 {
-                taken.remove(&self.network);
+                taken.by_network.remove(&self.network);
             }
         }
     }
@@ -84,7 +101,8 @@ pub(super) async fn limit(State(places): State<Places>, request: Request, next: 
             "{} has {} requests in progress; wait for the end of some",
             client.address, places.per_address
         );
-        return ApiError::new(Code::RateLimited, detail).into_response();
+        let seconds = places.next_end(client.address);
+        return ApiError::new(Code::RateLimited, detail).retry_after(seconds).into_response();
     };
     next.run(request).await.map(|body| Body::new(Held { body, _place: place }))
 }
@@ -130,7 +148,7 @@ mod tests {
             held.pop();
             assert!(places.take(one).is_some());
             drop(held);
-            assert!(places.taken.lock().unwrap().is_empty());
+            assert!(places.taken.lock().unwrap().by_network.is_empty());
         }
     }
 

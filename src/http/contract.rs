@@ -9,14 +9,13 @@ use std::sync::LazyLock;
 
 use axum::response::Response;
 
+use super::asset::Asset;
 use super::context::RequestContext;
-use super::dashboard::Asset;
 use super::error::Result;
 
 const YAML: &str = include_str!("../../openapi.yaml");
 
-static AS_YAML: LazyLock<Asset> =
-    LazyLock::new(|| Asset::new("application/yaml", YAML.as_bytes().to_vec()));
+static AS_YAML: LazyLock<Asset> = LazyLock::new(|| Asset::new("application/yaml", YAML));
 
 static AS_JSON: LazyLock<Asset> = LazyLock::new(|| {
     // A test reads the same text. If it failed here, the document would be empty.

@@ -88,6 +88,9 @@ codes! {
 
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
 
+/// Largest estimate in `Retry-After`, in seconds.
+pub(super) const MAX_RETRY_SECONDS: f64 = 600.0;
+
 tokio::task_local! {
     /// The identifier of the request that is being answered.
     pub(super) static REQUEST_ID: String;
@@ -177,6 +180,11 @@ impl ApiError {
         self
     }
 
+    /// States an estimate of the seconds after which the request may succeed.
+    pub(super) fn retry_after(self, seconds: u64) -> Self {
+        self.with_header(header::RETRY_AFTER, seconds.into())
+    }
+
     /// The body of the answer.
     pub(super) fn problem(&self) -> Problem {
         let (status, title, retryable) = self.code.row();
@@ -258,7 +266,7 @@ impl From<StoreError> for ApiError {
             StoreError::QueueFull { .. } => Code::QueueFull,
             StoreError::Quota { .. } => Code::QuotaExceeded,
             StoreError::ManyPartials(_) => Code::TooManyUploads,
-            StoreError::ManyChecks(_) => Code::TooManyChecks,
+            StoreError::ManyChecks { .. } => Code::TooManyChecks,
             StoreError::NoRoom { .. } | StoreError::NoShare { .. } => Code::InsufficientStorage,
             StoreError::Short { .. } => {
                 tracing::error!(%error, "bytes of an upload are lost");
@@ -287,6 +295,10 @@ impl From<StoreError> for ApiError {
             | StoreError::Refused { .. }
             | StoreError::Corrupt { .. } => return Self::internal(&error),
         };
+        if let StoreError::ManyChecks { mean_seconds: Some(seconds), .. } = error {
+            let seconds = seconds.clamp(1.0, MAX_RETRY_SECONDS).ceil() as u64;
+            return Self::new(code, error.to_string()).retry_after(seconds);
+        }
         // A failed calibration or measurement never becomes ready.
         let may_succeed_later = !matches!(
             error,

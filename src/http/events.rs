@@ -140,7 +140,7 @@ impl Events {
         (kind, name): (Kind, String),
         settled: impl Fn() -> F,
     ) -> Result<()> {
-        let _place = self.waiters.take(lab)?;
+        let _place = self.waiters.take(lab, time)?;
         // Subscribes before the first check, so that no change is missed in between.
         let mut receiver = self.sender.subscribe();
         let ended = async {
@@ -169,35 +169,44 @@ impl Events {
     }
 }
 
-/// Number of waiting requests of each lab.
+/// The latest ends of the waiting requests of each lab.
 #[derive(Debug, Clone, Default)]
-struct Waiters(Arc<Mutex<HashMap<Lab, usize>>>);
+struct Waiters(Arc<Mutex<HashMap<Lab, Vec<Instant>>>>);
 
 /// A waiting request. It is counted until this is dropped.
 #[derive(Debug)]
-struct Waiter(Waiters, Lab);
+struct Waiter(Waiters, Lab, Instant);
 
 impl Waiters {
-    fn take(&self, lab: &Lab) -> Result<Waiter> {
+    /// Counts a request that waits for `time` at most.
+    ///
+    /// Errors: 429 if enough requests of the lab wait; one of them ends within the seconds of `Retry-After`.
+    fn take(&self, lab: &Lab, time: Duration) -> Result<Waiter> {
+        let now = Instant::now();
         let mut waiting = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let count = waiting.entry(lab.clone()).or_default();
-        if *count >= WAITERS {
+        let ends = waiting.entry(lab.clone()).or_default();
+        if ends.len() >= WAITERS {
             let detail = format!(
                 "{WAITERS} requests of this lab are waiting already; send the request without wait"
             );
-            return Err(ApiError::new(Code::TooManyWaiters, detail));
+            let next = ends.iter().min().map(|end| end.saturating_duration_since(now));
+            let seconds = next.unwrap_or_default().as_secs_f64().ceil().max(1.0) as u64;
+            return Err(ApiError::new(Code::TooManyWaiters, detail).retry_after(seconds));
         }
-        *count += 1;
-        Ok(Waiter(self.clone(), lab.clone()))
+        let end = now + time;
+        ends.push(end);
+        Ok(Waiter(self.clone(), lab.clone(), end))
     }
 }
 
 impl Drop for Waiter {
     fn drop(&mut self) {
         let mut waiting = self.0.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(count) = waiting.get_mut(&self.1) {
-            *count -= 1;
-            if *count == 0 {
+        if let Some(ends) = waiting.get_mut(&self.1) {
+            if let Some(own) = ends.iter().position(|end| *end == self.2) {
+                ends.swap_remove(own);
+            }
+            if ends.is_empty() {
                 waiting.remove(&self.1);
             }
         }
@@ -298,9 +307,9 @@ pub(super) async fn listen(
     access: Access,
     headers: HeaderMap,
 ) -> Result<Response> {
-    let place = events.places.take(&access.lab).ok_or_else(|| {
+    let place = events.places.take(&access.lab).map_err(|full| {
         let detail = "the service or this lab has too many listeners; poll the lists instead";
-        ApiError::new(Code::Unavailable, detail)
+        ApiError::new(Code::Unavailable, detail).retry_after(full.seconds)
     })?;
     let mut listener = Listener {
         lab: access.lab,

@@ -12,22 +12,21 @@ use strum::VariantArray;
 use super::access::Access;
 use super::app::App;
 use super::context::{RequestContext, changed};
-use super::error::{ApiError, Code, Problem, Result};
+use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::problems;
+use super::truth;
 use engine::job::{
-    Algorithm, Assessment, CalibrationId, Finding, FindingCode, InvalidField, JobId, JobRequest,
-    JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Role, RunSpec, SceneShape, Schedule,
-    Sequence, SnapshotRange, TileSpec, Timestamp, priority_error,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
+    JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Registered,
+    RegistrationRequest, Role, RunSpec, SceneShape, Schedule, Sequence, Sha256, SnapshotRange,
+    TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
     Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
     NewJob, Page, RequestKey, Span, StoreError,
 };
-
-/// Largest value of `Retry-After` when the queue is full, in seconds.
-const MAX_RETRY_SECONDS: f64 = 600.0;
 
 /// A job with its progress.
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -39,7 +38,10 @@ pub(super) struct JobBody {
     label: Option<Label>,
     calibration: CalibrationId,
     measurement: MeasurementId,
+    /// The size of the frames.
     shape: SceneShape,
+    /// Displacement of the bands of a spectral camera, whose bands are the frames; null for a video.
+    dispersion: Option<Dispersion>,
     snapshots: SnapshotRange,
     sequence: Sequence,
     run: RunSpec,
@@ -48,8 +50,13 @@ pub(super) struct JobBody {
     model: Option<ModelId>,
     schedule: Schedule,
     tile: TileSpec,
+    registration: RegistrationRequest,
+    /// The outcome of the registration; null before it, and if it is off.
+    registered: Option<Registered>,
     priority: i32,
-    /// Findings of the check of the measurement, and `bad_calibration`.
+    /// The upload with the true frames; null if they are unknown.
+    truth: Option<Sha256>,
+    /// Findings of the check of the measurement, `bad_calibration`, and `moved_masks`.
     warnings: Vec<Finding>,
     /// The failure in words.
     error: Option<String>,
@@ -61,7 +68,54 @@ pub(super) struct JobBody {
     /// Predicted quality of the frames, mean over the snapshots. Null until the job has succeeded, and where no prediction
     /// is possible: colour sensors, models of users, and schedules without a quality model.
     assessment: Option<Assessment>,
+    /// The address that is notified when the job ends.
+    webhook: Option<WebhookBody>,
     progress: JobProgress,
+}
+
+/// The notification of a job.
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "JobWebhook")]
+struct WebhookBody {
+    url: Webhook,
+    state: WebhookState,
+    /// Failed attempts since the job ended.
+    attempts: u32,
+    /// Time of the next attempt.
+    next_at: Option<Timestamp>,
+    /// Why the last attempt failed.
+    error: Option<String>,
+}
+
+/// State of a notification.
+#[derive(Debug, Clone, Copy, Serialize, schemars::JsonSchema)]
+#[serde(rename_all = "snake_case")]
+enum WebhookState {
+    /// The job has not ended.
+    Pending,
+    /// It is being sent, or sent again after a pause.
+    Sending,
+    /// The receiver has confirmed it.
+    Delivered,
+    /// It was given up.
+    Failed,
+}
+
+impl WebhookBody {
+    async fn new(app: &App, job: &Job) -> Result<Option<Self>> {
+        let Some(url) = job.spec.webhook.clone() else { return Ok(None) };
+        let delivery = app.store.delivery(job).await?;
+        let state = match &delivery {
+            _ if !job.state.is_final() => WebhookState::Pending,
+            None => WebhookState::Delivered,
+            Some(delivery) if delivery.next_at.is_some() => WebhookState::Sending,
+            Some(_) => WebhookState::Failed,
+        };
+        let attempts = delivery.as_ref().map_or(0, |delivery| delivery.attempts);
+        let (next_at, error) =
+            delivery.map_or((None, None), |delivery| (delivery.next_at, delivery.error));
+        Ok(Some(Self { url, state, attempts, next_at, error }))
+    }
 }
 
 /// The failure of a job. Codes are `task_failed`, `out_of_memory`, `worker_crashed` and `worker_lost`.
@@ -112,7 +166,9 @@ impl JobBody {
             }
             _ => None,
         };
+        let webhook = WebhookBody::new(app, &job).await?;
         let spec = job.spec;
+        let shape = spec.frame_shape();
         Ok(Self {
             id: job.id,
             lab: job.lab,
@@ -120,7 +176,8 @@ impl JobBody {
             label: spec.label,
             calibration: spec.calibration,
             measurement: spec.measurement,
-            shape: spec.shape,
+            shape,
+            dispersion: spec.dispersion,
             snapshots: spec.snapshots,
             sequence: spec.sequence,
             run: spec.run,
@@ -128,7 +185,10 @@ impl JobBody {
             model: spec.model.map(|model| model.id),
             schedule: spec.schedule,
             tile: spec.tile,
+            registration: spec.registration,
+            registered: spec.registered,
             priority: spec.priority,
+            truth: spec.truth,
             warnings: spec.warnings,
             error: job.error,
             problem,
@@ -136,6 +196,7 @@ impl JobBody {
             started_at: job.started_at,
             finished_at: job.finished_at,
             assessment: job.assessment,
+            webhook,
             progress,
         })
     }
@@ -189,6 +250,10 @@ pub(super) struct Changes {
     /// From -100 to 100; above 0 with the role admin alone.
     #[schemars(range(min = -100, max = 100))]
     priority: Option<i32>,
+    /// The upload with the true frames. Null removes it from the job; the upload is kept.
+    #[serde(default, with = "serde_with::rust::double_option")]
+    #[schemars(with = "Option<Sha256>")]
+    truth: Option<Option<Sha256>>,
 }
 
 /// Predicted cost of a job.
@@ -248,9 +313,7 @@ async fn insert(
     let new = NewJob { most_jobs, lab, spec, key };
     let place = app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new));
     match place.await {
-        Err(full) if full.code() == Code::QueueFull => {
-            Err(full.with_header(header::RETRY_AFTER, next_end(app).await?.into()))
-        }
+        Err(full) if full.code() == Code::QueueFull => Err(full.retry_after(next_end(app).await?)),
         inserted => inserted,
     }
 }
@@ -287,6 +350,7 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     };
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
+    let resolved = resolved.and_then(|spec| spec.with_dispersion(calibration.facts.dispersion));
     let mut spec = resolved.map_err(|errors| ApiError::fields(Code::InvalidRequest, errors))?;
     // If the report is not finished yet, the task that writes it adds the warning. A bad calibration causes other findings,
     // so it comes first.
@@ -295,6 +359,10 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
     spec.warnings.extend(warnings_of(measurement.warnings, spec.snapshots));
     check_memory(app, &spec)?;
     check_networks(app, &spec)?;
+    check_webhook(app, &spec)?;
+    if let Some(truth) = spec.truth {
+        truth::check(app, lab, truth, spec.frame_shape()).await?;
+    }
     Ok(spec)
 }
 
@@ -315,6 +383,20 @@ fn warnings_of(warnings: Vec<Finding>, snapshots: SnapshotRange) -> Vec<Finding>
     let concerns =
         |warning: &Finding| warning.snapshot.is_none_or(|snapshot| snapshots.contains(snapshot));
     warnings.into_iter().filter(concerns).collect()
+}
+
+/// Rejects a webhook on a host that the administrator has not allowed.
+fn check_webhook(app: &App, spec: &JobSpec) -> Result<()> {
+    let Some(webhook) = &spec.webhook else { return Ok(()) };
+    if webhook.is_allowed(&app.settings.webhook_hosts) {
+        return Ok(());
+    }
+    let place = webhook.place();
+    let detail = format!(
+        "webhooks may not notify the host {place}: ask the administrator to start the service with \
+         --webhook-host {place}"
+    );
+    Err(ApiError::fields(Code::InvalidRequest, vec![InvalidField::new("/webhook", detail)]))
 }
 
 /// Rejects a job that needs more memory than a worker has.
@@ -416,14 +498,18 @@ pub(super) async fn change(
     request: RequestContext,
     Body(changes): Body<Changes>,
 ) -> Result<Response> {
-    let Changes { label, priority } = changes;
+    let Changes { label, priority, truth } = changes;
     let invalid = priority.and_then(|to| priority_error(to).or_else(|| role_error(&access, to)));
     if let Some(error) = invalid {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
     let _guard =
         request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
-    app.store.change_job(&access.lab, id, &JobChanges { label, priority }).await?;
+    if let Some(Some(sha256)) = truth {
+        let shape = app.store.job(&access.lab, id).await?.spec.frame_shape();
+        truth::check(&app, &access.lab, sha256, shape).await?;
+    }
+    app.store.change_job(&access.lab, id, &JobChanges { label, priority, truth }).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 

@@ -1,17 +1,25 @@
-//! What happens to every request around its handler.
+//! What happens to every request around its handler, apart from what layers of `tower-http` do.
 
 use std::any::Any;
 use std::convert::Infallible;
+use std::future::{Ready, ready};
 use std::time::Instant;
 
+use axum::BoxError;
 use axum::body::Body;
+use axum::error_handling::HandleErrorLayer;
 use axum::extract::{MatchedPath, OriginalUri, Request, State};
-use axum::http::{HeaderName, HeaderValue, Method, StatusCode, Version, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use tower::{Layer, Service, ServiceExt, service_fn};
+use tower::layer::util::{Identity, Stack};
+use tower::limit::GlobalConcurrencyLimitLayer;
+use tower::load_shed::LoadShedLayer;
+use tower::{Layer, Service, ServiceBuilder, ServiceExt, service_fn};
 use tower_http::cors::CorsLayer;
-use tracing::Instrument;
+use tower_http::request_id::{MakeRequestId, RequestId};
+use tower_http::set_header::SetResponseHeaderLayer;
+use tracing::Span;
 use tracing::field::Empty;
 use uuid::Uuid;
 
@@ -22,23 +30,114 @@ use super::metrics;
 use store::Store;
 
 const HEADER: HeaderName = HeaderName::from_static("x-request-id");
+const TRACE_PARENT: HeaderName = HeaderName::from_static("traceparent");
 
-/// Gives the request an identifier, or keeps the client's; logs and counts it when it is answered.
+/// Makes identifiers of requests.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct NewId;
+
+impl MakeRequestId for NewId {
+    fn make_request_id<B>(&mut self, _: &axum::http::Request<B>) -> Option<RequestId> {
+        HeaderValue::try_from(Uuid::now_v7().to_string()).ok().map(RequestId::new)
+    }
+}
+
+/// Removes an identifier with characters that a log can't show.
+pub(super) fn without_odd_id(mut request: Request) -> Request {
+    if request.headers().get(&HEADER).is_some_and(|id| !is_plain(id)) {
+        request.headers_mut().remove(&HEADER);
+    }
+    request
+}
+
+/// The span of a request, which its log lines show: its identifier, and the trace of a caller that sends `traceparent`.
+pub(super) fn span(request: &Request) -> Span {
+    let (method, path) = (request.method(), request.uri().path());
+    let id = identifier(request);
+    let span = tracing::info_span!(
+        "request", id, %method, path, lab = Empty, trace_id = Empty, parent_id = Empty
+    );
+    if let Some((trace, parent)) = trace_parent(request.headers()) {
+        span.record("trace_id", trace).record("parent_id", parent);
+    }
+    span
+}
+
+fn identifier(request: &Request) -> &str {
+    let id = request.headers().get(&HEADER).and_then(|id| id.to_str().ok());
+    id.unwrap_or("unknown")
+}
+
+/// The identifiers of the trace and of the caller's span, in hexadecimal digits (W3C Trace Context). A malformed or repeated
+/// header is ignored, as the standard requires.
+fn trace_parent(headers: &HeaderMap) -> Option<(&str, &str)> {
+    let mut values = headers.get_all(&TRACE_PARENT).iter();
+    let value = values.next().filter(|_| values.next().is_none())?.to_str().ok()?;
+    let is_hex = |text: &str, digits: usize| {
+        text.len() == digits && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
+    };
+    let is_identifier =
+        |text: &str, digits: usize| is_hex(text, digits) && text.bytes().any(|byte| byte != b'0');
+    let mut parts = value.split('-');
+    let (version, trace, parent, flags) =
+        (parts.next()?, parts.next()?, parts.next()?, parts.next()?);
+    // Later versions may have more parts.
+    let is_known = is_hex(version, 2) && version != "ff";
+    let is_complete = version != "00" || parts.next().is_none();
+    (is_known
+        && is_complete
+        && is_hex(flags, 2)
+        && is_identifier(trace, 32)
+        && is_identifier(parent, 16))
+    .then_some((trace, parent))
+}
+
+/// Refuses requests beyond a number in progress, so that a flood does not exhaust the memory.
+pub(super) type Shedding = ServiceBuilder<
+    Stack<
+        GlobalConcurrencyLimitLayer,
+        Stack<
+            LoadShedLayer,
+            Stack<HandleErrorLayer<fn(BoxError) -> Ready<ApiError>, ()>, Identity>,
+        >,
+    >,
+>;
+
+/// Routes with clones of this layer share the number.
+pub(super) fn shedding(most: usize) -> Shedding {
+    let overloaded: fn(BoxError) -> Ready<ApiError> = |_| {
+        let detail = "too many requests are in progress; nothing was changed; try again";
+        ready(ApiError::new(Code::Unavailable, detail).retry_after(1))
+    };
+    ServiceBuilder::new()
+        .layer(HandleErrorLayer::new(overloaded))
+        .layer(LoadShedLayer::new())
+        .layer(GlobalConcurrencyLimitLayer::new(most))
+}
+
+/// Headers that restrict browsers, for answers that do not set their own.
+pub(super) fn restrictions() -> [SetResponseHeaderLayer<HeaderValue>; 3] {
+    [
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::CONTENT_SECURITY_POLICY, "frame-ancestors 'none'"),
+    ]
+    .map(|(name, value)| {
+        SetResponseHeaderLayer::if_not_present(name, HeaderValue::from_static(value))
+    })
+}
+
+/// Logs and counts the request when it is answered.
 pub(super) async fn observe(mut request: Request, next: Next) -> Response {
-    let id = request.headers().get(&HEADER).filter(|id| is_plain(id)).cloned();
-    let id = id.unwrap_or_else(new_id);
-    request.headers_mut().insert(HEADER, id.clone());
+    let id = identifier(&request).to_owned();
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let route = request.extensions().get::<MatchedPath>().map(|route| route.as_str().to_owned());
-    let span = tracing::info_span!("request", id = id.to_str().unwrap_or(""), %method, path = %path, lab = Empty);
     let admitted = Admitted::default();
     request.extensions_mut().insert(admitted.clone());
     let start = Instant::now();
-    let answer = next.run(request).instrument(span.clone());
-    let mut response = REQUEST_ID.scope(id.to_str().unwrap_or("").to_owned(), answer).await;
+    let response = REQUEST_ID.scope(id, next.run(request)).await;
     let (status, took) = (response.status().as_u16(), start.elapsed());
     // A status that everyone polls for is not worth a line each. Strangers must not fill the log.
-    let _entered = span.enter();
     let is_stranger = admitted.get().is_none() && !response.status().is_server_error();
     if is_stranger || is_quiet(&method, &path) {
         tracing::debug!(status, ms = took.as_millis(), "answered");
@@ -46,7 +145,6 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
         tracing::info!(status, ms = took.as_millis(), "answered");
     }
     metrics::observe(known(&method), route.as_deref().unwrap_or("none"), status, took);
-    response.headers_mut().insert(HEADER, id);
     response
 }
 
@@ -73,11 +171,6 @@ fn is_plain(id: &HeaderValue) -> bool {
     let bytes = id.as_bytes();
     (1..=100).contains(&bytes.len())
         && bytes.iter().all(|byte| byte.is_ascii_alphanumeric() || b"-_.:/+=".contains(byte))
-}
-
-fn new_id() -> HeaderValue {
-    let text = Uuid::now_v7().to_string();
-    HeaderValue::try_from(text).unwrap_or_else(|_| HeaderValue::from_static("unknown"))
 }
 
 /// Makes references in headers relative to the address of the request, so that they hold below any prefix that a proxy
@@ -116,6 +209,7 @@ pub(super) fn exposed() -> Vec<HeaderName> {
         "tus-checksum-algorithm",
         "upload-offset",
         "upload-length",
+        "upload-defer-length",
         "upload-metadata",
         "upload-expires",
     ];
@@ -235,4 +329,78 @@ pub(super) async fn method_not_allowed(request: Request) -> ApiError {
 
 fn shortened(text: &str) -> String {
     text.chars().take(120).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use axum::Router;
+    use axum::body::Body;
+    use axum::extract::Request;
+    use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+    use axum::routing::get;
+    use tokio::sync::Notify;
+    use tower::ServiceExt;
+
+    use super::{TRACE_PARENT, shedding, trace_parent};
+
+    #[test]
+    fn a_trace_is_taken_from_a_valid_header_alone() {
+        let (trace, parent) = ("4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7");
+        let of = |values: &[&str]| {
+            let values = values.iter().map(|value| (TRACE_PARENT, value.parse().unwrap()));
+            let headers: HeaderMap<HeaderValue> =
+                values.fold(HeaderMap::new(), |mut all, (name, value)| {
+                    all.append(name, value);
+                    all
+                });
+            trace_parent(&headers).map(|(trace, parent)| (trace.to_owned(), parent.to_owned()))
+        };
+        let valid = format!("00-{trace}-{parent}-01");
+        for good in [valid.clone(), format!("cc-{trace}-{parent}-00-later")] {
+            assert_eq!(of(&[&good]), Some((trace.to_owned(), parent.to_owned())), "{good}");
+        }
+        assert_eq!(of(&[&valid, &valid]), None);
+        for bad in [
+            String::new(),
+            "00".to_owned(),
+            format!("00-{trace}-{parent}"),
+            format!("00-{trace}-{parent}-01-more"),
+            format!("ff-{trace}-{parent}-01"),
+            format!("00-{}-{parent}-01", trace.to_uppercase()),
+            format!("00-{}-{parent}-01", "0".repeat(32)),
+            format!("00-{trace}-{}-01", "0".repeat(16)),
+            format!("00-{trace}0-{parent}-01"),
+        ] {
+            assert_eq!(of(&[&bad]), None, "{bad}");
+        }
+    }
+
+    #[tokio::test]
+    async fn requests_beyond_the_limit_are_refused() {
+        let (limit, gate) = (shedding(2), Arc::new(Notify::new()));
+        let wait = || {
+            let gate = gate.clone();
+            get(move || async move { gate.notified().await }).layer(limit.clone())
+        };
+        let router = Router::new().route("/a", wait()).route("/b", wait());
+        let send = |path: &str| {
+            let request = Request::builder().uri(path).body(Body::empty()).unwrap();
+            router.clone().oneshot(request)
+        };
+        let held = [tokio::spawn(send("/a")), tokio::spawn(send("/b"))];
+        tokio::task::yield_now().await;
+        for path in ["/a", "/b"] {
+            let refused = send(path).await.unwrap();
+            assert_eq!(refused.status(), StatusCode::SERVICE_UNAVAILABLE);
+            assert_eq!(refused.headers()[header::RETRY_AFTER], "1");
+        }
+        gate.notify_waiters();
+        for answer in held {
+            assert_eq!(answer.await.unwrap().unwrap().status(), StatusCode::OK);
+        }
+        gate.notify_one();
+        assert_eq!(send("/b").await.unwrap().status(), StatusCode::OK);
+    }
 }

@@ -13,16 +13,17 @@ use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
 use super::results::{result_file, white_level};
-use engine::intake::{Opened, Source};
+use super::truth::open;
+use engine::intake::Opened;
 use engine::job::{JobId, SceneShape, Sha256};
 use engine::pipeline::quality::{FrameQuality, Quality};
-use formats::mat::SceneArray;
 use formats::{Axes, Channels, FormatError, Limits, npy};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct QualityQuery {
-    truth: Sha256,
+    /// By default the truth of the job.
+    truth: Option<Sha256>,
     full_scale: Option<f32>,
     axes: Option<Axes>,
 }
@@ -44,21 +45,20 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response> {
     let job = with_snapshot(&app, &access.lab, id, snapshot).await?;
-    app.store.upload(&access.lab, query.truth).await?;
+    let QualityQuery { truth, full_scale, axes } = query;
+    let truth = truth.or(job.spec.truth).ok_or_else(|| {
+        let detail = "the job has no true frames: state an upload as truth in the query, or attach it to \
+                      the job with PATCH";
+        ApiError::new(Code::InvalidQuery, detail)
+    })?;
+    app.store.upload(&access.lab, truth).await?;
     result_file(&app, &job, Some(snapshot), "frames.npy").await?;
     let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
-    let (shape, truth) = (job.spec.shape, query.truth);
     let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
-    let limits = app.limits;
+    let (shape, limits) = (job.spec.frame_shape(), app.limits);
     let frames = intake::run(&app, &access.lab, move || {
-        let truth = Source::upload(&upload, SceneArray::Truth, query.full_scale, limits);
-        // The truth of a colour sensor may have colours, or one colour for each pixel, as the sensor records it.
-        let colours = if shape.mosaic.is_some() { truth.open_colours()? } else { None };
-        if let Some(colours) = colours {
-            return compare((&path, Channels::Rgb), colours, snapshot as usize, shape);
-        }
-        let truth = truth.arranged(query.axes, Some((shape.height, shape.width)));
-        compare((&path, Channels::Grey), truth.open()?, snapshot as usize, shape)
+        let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
+        compare((&path, channels), truth, snapshot as usize, shape)
     });
     let quality: Quality = frames.await?.into();
     let peak = white_level(&app, id).await?.unwrap_or(1.0);
@@ -74,19 +74,8 @@ fn compare(
     shape: SceneShape,
 ) -> Result<Vec<FrameQuality>> {
     let SceneShape { frames, height, snapshots, mosaic, .. } = shape;
-    let width = shape.width * channels.count();
-    let info = truth.info;
-    let all = frames * snapshots as usize;
-    if (info.height, info.width) != (height, width) || ![frames, all].contains(&info.frames) {
-        let (rows, columns) = (info.height, info.width / channels.count());
-        let detail = format!(
-            "the truth has {} frames of {rows}x{columns}; it should have {frames} of {height}x{} for this \
-             snapshot, or {all} for all",
-            info.frames, shape.width
-        );
-        return Err(ApiError::new(Code::SizeMismatch, detail));
-    }
-    let skipped = if info.frames == all { snapshot * frames } else { 0 };
+    let has_all = truth.info.frames == frames * snapshots as usize;
+    let skipped = if has_all { snapshot * frames } else { 0 };
     for _ in 0..skipped {
         next(&mut truth)?;
     }

@@ -5,7 +5,7 @@ use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use axum::http::{HeaderMap, HeaderName, HeaderValue, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue};
 
 use super::error::{ApiError, Code};
 
@@ -74,8 +74,7 @@ impl Rate {
         let seconds = self.seconds_to(0.0);
         let what = what(self.quota);
         let detail = format!("{what} in a minute; the next one is accepted in {seconds} seconds");
-        Err(ApiError::new(Code::RateLimited, detail)
-            .with_header(header::RETRY_AFTER, seconds.into()))
+        Err(ApiError::new(Code::RateLimited, detail).retry_after(seconds))
     }
 
     /// Whole seconds until the bucket has this level.

@@ -14,6 +14,8 @@ use tower::ServiceBuilder;
 use tower::util::MapRequestLayer;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::cors::{AllowHeaders, CorsLayer};
+use tower_http::request_id::{PropagateRequestIdLayer, SetRequestIdLayer};
+use tower_http::trace::TraceLayer;
 
 use super::access::{self, Rule};
 use super::app::App;
@@ -22,12 +24,15 @@ use super::listen::connection_limit;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::{
     algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
-    layers, me, measurements, models, pictures, problems, quality, reports, results, samples,
-    session, system, tiles, tus,
+    layers, me, measurements, models, pictures, problems, quality, reference, reports, results,
+    samples, session, system, tiles, tus,
 };
 
 /// Time for which a browser remembers what another origin may do.
 const PREFLIGHT_AGE: Duration = Duration::from_secs(3600);
+
+/// Requests in progress. Two addresses with all their connections do not reach it.
+const MOST_REQUESTS: usize = 4096;
 
 /// The largest JSON body.
 const JSON_BYTES: usize = 256 * 1024;
@@ -75,6 +80,8 @@ pub fn routes() -> Vec<Route> {
         // Pages and what only they use: no part of the API that clients rely on.
         R::at("/").get(dashboard::page).only(Rule::Public),
         R::at("/dashboard/{file}").get(dashboard::file).only(Rule::Public),
+        R::at("/docs").get(reference::page).only(Rule::Public),
+        R::at("/docs/{file}").get(reference::file).only(Rule::Public),
         R::at("/problems/{code}").get(problems::show).only(Rule::Public),
         R::at("/openapi.yaml").get(contract::yaml).only(Rule::Public),
         R::at("/openapi.json").get(contract::json).only(Rule::Public),
@@ -85,12 +92,15 @@ pub fn routes() -> Vec<Route> {
         R::at("/view/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).slow(),
         R::at("/view/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>).slow(),
         R::at("/view/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfCalibration>).slow(),
         R::at("/view/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).slow(),
         R::at("/view/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>).slow(),
         R::at("/view/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfMeasurement>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfJob>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
     ]
@@ -102,6 +112,7 @@ pub fn router(app: App) -> Router {
     let late = HandleErrorLayer::new(move |_: BoxError| async move { layers::timed_out(seconds) });
     let timeout = ServiceBuilder::new().layer(late).timeout(app.settings.request_time());
     let close = map_response(layers::close_after_refusal);
+    let shedding = layers::shedding(MOST_REQUESTS);
     let sites = Arc::new(access::Sites::new(&app.settings, app.audit.clone()));
     let mut router = Router::new();
     for route in routes() {
@@ -115,9 +126,24 @@ pub fn router(app: App) -> Router {
         let handlers = handlers.route_layer(reserve).route_layer(guard);
         let handlers = if route.is_pure { handlers } else { handlers.route_layer(record) };
         let handlers = if route.uploads { handlers.layer(close.clone()) } else { handlers };
+        // Probes are answered under load, too.
+        let is_probe = route.rule == Rule::Public;
+        let handlers = if is_probe { handlers } else { handlers.layer(shedding.clone()) };
         router = router.route(route.path, handlers);
     }
     let origins = cors(&app.settings.cors_origins);
+    let [sniffing, referrer, framing] = layers::restrictions();
+    let trace = TraceLayer::new_for_http()
+        .make_span_with(layers::span)
+        .on_request(())
+        .on_response(())
+        .on_failure(());
+    let observation = ServiceBuilder::new()
+        .layer(MapRequestLayer::new(layers::without_odd_id))
+        .layer(SetRequestIdLayer::x_request_id(layers::NewId))
+        .layer(PropagateRequestIdLayer::x_request_id())
+        .layer(trace)
+        .layer(from_fn(layers::observe));
     let router = router
         .fallback(layers::not_found)
         .method_not_allowed_fallback(layers::method_not_allowed)
@@ -126,7 +152,8 @@ pub fn router(app: App) -> Router {
         .layer(from_fn_with_state(Places::new(connection_limit()), client_places::limit))
         .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::relative_references))
-        .layer(from_fn(layers::observe))
+        .layer(ServiceBuilder::new().layer(sniffing).layer(referrer).layer(framing))
+        .layer(observation)
         .with_state(app);
     // Around the routes: what changes the method or the path of a request.
     let rewritten = ServiceBuilder::new().layer(MapRequestLayer::new(tus::rewrite)).service(router);

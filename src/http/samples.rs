@@ -16,8 +16,8 @@ use super::jobs::{self, JobBody};
 use super::submissions::make;
 use engine::intake::sample;
 use engine::job::{
-    Algorithm, CalibrationRequest, JobRequest, Label, MeasurementRequest, Sha256,
-    SnapshotSelection, Submission,
+    Algorithm, CalibrationRequest, JobRequest, Label, MeasurementRequest, RegistrationRequest,
+    Sha256, SnapshotSelection, Submission,
 };
 use store::{RequestKey, StagedBlob, Store};
 
@@ -41,7 +41,7 @@ pub(super) struct SampleBody {
     masks: Sha256,
     /// The file of the measurement.
     data: Sha256,
-    /// The file of the true frames, for `quality`.
+    /// The file of the true frames, which belong to the job.
     truth: Sha256,
     job: JobBody,
 }
@@ -82,8 +82,11 @@ pub(super) async fn create(
         model: None,
         schedule: None,
         tile: None,
+        registration: RegistrationRequest::Off,
         priority: 0,
+        truth: Some(truth),
         label: request.label,
+        webhook: None,
     };
     let key = hashed_key(key, &job)?;
     let (status, job) = jobs::make(&app, &access, job, key).await?;

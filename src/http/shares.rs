@@ -2,10 +2,12 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::Instant;
 
 use tokio::sync::{Mutex as AsyncMutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
 use super::error::{ApiError, Code, Result};
+use super::turnover::Turnover;
 use engine::job::Lab;
 
 /// Places for requests that take long. A lab gets at most half of them. A lab without a place always gets one, even if
@@ -14,7 +16,20 @@ use engine::job::Lab;
 pub(super) struct Places {
     most: usize,
     of_a_lab: usize,
-    taken: Arc<Mutex<HashMap<Lab, usize>>>,
+    taken: Arc<Mutex<Taken>>,
+}
+
+#[derive(Debug, Default)]
+struct Taken {
+    by_lab: HashMap<Lab, usize>,
+    turnover: Turnover,
+}
+
+/// No place is free for the lab.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Full {
+    /// Estimated time until one is free.
+    pub(super) seconds: u64,
 }
 
 /// A place. It is free again when this is dropped.
@@ -22,6 +37,7 @@ pub(super) struct Places {
 pub(super) struct Place {
     places: Places,
     lab: Lab,
+    since: Instant,
 }
 
 impl Places {
@@ -29,26 +45,30 @@ impl Places {
         Self { most, of_a_lab: most.div_ceil(2).max(1), taken: Arc::default() }
     }
 
-    /// Takes a place for this lab. `None` if the lab has its share, or if all places are taken.
-    pub(super) fn take(&self, lab: &Lab) -> Option<Place> {
+    /// Takes a place for this lab.
+    ///
+    /// Errors: [`Full`] if the lab has its share, or if all places are taken.
+    pub(super) fn take(&self, lab: &Lab) -> Result<Place, Full> {
         let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        let all = taken.values().sum::<usize>();
-        let own = taken.get(lab).copied().unwrap_or_default();
+        let all = taken.by_lab.values().sum::<usize>();
+        let own = taken.by_lab.get(lab).copied().unwrap_or_default();
         if own > 0 && (own >= self.of_a_lab || all >= self.most) {
-            return None;
+            let held = if own >= self.of_a_lab { own } else { all };
+            return Err(Full { seconds: taken.turnover.next_end(held) });
         }
-        *taken.entry(lab.clone()).or_default() += 1;
-        Some(Place { places: self.clone(), lab: lab.clone() })
+        *taken.by_lab.entry(lab.clone()).or_default() += 1;
+        Ok(Place { places: self.clone(), lab: lab.clone(), since: Instant::now() })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
         let mut taken = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(own) = taken.get_mut(&self.lab) {
+        taken.turnover.record(self.since.elapsed());
+        if let Some(own) = taken.by_lab.get_mut(&self.lab) {
             *own -= 1;
             if *own == 0 {
-                taken.remove(&self.lab);
+                taken.by_lab.remove(&self.lab);
             }
         }
     }
@@ -83,11 +103,9 @@ impl Turns {
     ///
     /// Errors: 429 if too many items of the lab wait; 503 if the service stops.
     pub(super) async fn take(&self, lab: &Lab) -> Result<Turn> {
-        let waiting = self.waiting.take(lab).ok_or_else(|| {
-            ApiError::new(
-                Code::TooManyChecks,
-                "too many files of this lab wait for a check; try again later",
-            )
+        let waiting = self.waiting.take(lab).map_err(|full| {
+            let detail = "too many files of this lab wait for a check; try again later";
+            ApiError::new(Code::TooManyChecks, detail).retry_after(full.seconds)
         })?;
         let stopped = |_| ApiError::new(Code::Unavailable, "the service is shutting down");
         let of_lab =
@@ -147,17 +165,14 @@ mod tests {
         let places = Places::new(4);
         let (a, b, c) = (lab("a"), lab("b"), lab("c"));
         let of_a: Vec<_> = (0..3).map(|_| places.take(&a)).collect();
-        assert!(of_a[1].is_some() && of_a[2].is_none(), "a lab gets half of the places");
+        assert!(of_a[1].is_ok() && of_a[2].is_err(), "a lab gets half of the places");
         let of_b = [places.take(&b), places.take(&b)];
-        assert!(of_b.iter().all(Option::is_some));
+        assert!(of_b.iter().all(Result::is_ok));
         let of_c = [places.take(&c), places.take(&c)];
-        assert!(
-            of_c[0].is_some() && of_c[1].is_none(),
-            "a lab gets one place although all are taken"
-        );
+        assert!(of_c[0].is_ok() && of_c[1].is_err(), "a lab gets one place although all are taken");
         drop(of_a);
-        assert!(places.take(&c).is_some());
-        assert!(Places::new(1).take(&a).is_some());
+        assert!(places.take(&c).is_ok());
+        assert!(Places::new(1).take(&a).is_ok());
     }
 
     #[tokio::test]

@@ -14,7 +14,7 @@ use super::app::{App, WORKER_AGE};
 use super::error::Result;
 use super::extract::Caller;
 use super::metrics::Figures;
-use crate::config::VERSION;
+use crate::config::{DeviceState, VERSION};
 use engine::job::{JobState, TaskState, Timestamp};
 use store::{StoreError, WorkerRow};
 use strum::VariantArray;
@@ -139,8 +139,10 @@ pub(super) struct Readiness {
     /// Connection to other machines; only with `serve --nats`.
     #[serde(skip_serializing_if = "Option::is_none")]
     cluster: Option<String>,
-    /// The library that jobs with networks need.
+    /// The library and the device that jobs with networks need.
     networks: String,
+    /// The device of this machine's workers, and whether one of them has run a network on it.
+    device: String,
     /// Confinement of networks of users, which keeps files from them.
     confinement: String,
 }
@@ -161,7 +163,7 @@ pub(super) async fn live() -> Json<Liveness> {
 pub(super) async fn ready(State(app): State<App>) -> Response {
     let checks =
         [database_answers(&app).await, disk_takes_files(&app).await, workers_live(&app).await];
-    let cluster = app.cluster.as_ref().map(|trouble| trouble.borrow().clone());
+    let cluster = app.machine.cluster.as_ref().map(|trouble| trouble.borrow().clone());
     let tiles_continue = matches!(cluster, None | Some(None)) || !app.settings.without_tiles();
     let ready = checks.iter().all(Result::is_ok) && tiles_continue;
     let [database, disk, workers] =
@@ -174,7 +176,8 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
     let tiles = tiles.err().unwrap_or_else(|| "ok".to_owned());
     let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
     let cluster = cluster.map(|trouble| trouble.unwrap_or_else(|| "ok".to_owned()));
-    let confinement = app.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
+    let confinement = app.machine.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
+    let device = device_state(&app);
     let body = Readiness {
         ready,
         degraded,
@@ -184,9 +187,22 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
         tiles,
         cluster,
         networks,
+        device,
         confinement,
     };
     (status, Json(body)).into_response()
+}
+
+/// The device of this machine's workers, with its state in words.
+fn device_state(app: &App) -> String {
+    let device = &app.settings.engine.device;
+    match &*app.machine.device.borrow() {
+        // The CPU is always there.
+        _ if device == "cpu" => device.clone(),
+        DeviceState::Ready => format!("{device}: a worker has run a network on it"),
+        DeviceState::Untried => format!("{device}: no worker of this machine has tried it yet"),
+        DeviceState::Refused(_) => format!("{device}: refused; see networks"),
+    }
 }
 
 async fn database_answers(app: &App) -> Result<(), String> {

@@ -52,7 +52,17 @@ export async function submit(page, checks, scene, small) {
   await drop(page, data, "masks.npy", scene.masks.subarray(0, 200));
   await page.waitForSelector(".step:nth-child(2) .trouble");
   checks.that(await page.isDisabled("button[type=submit]"), "nothing is submitted without a measurement");
+  // A larger picture is mended by a window.
+  await drop(page, data, "larger.npy", scene.framed(16));
+  await page.click("text=Use a window of 720 × 960");
+  await page.fill("#data-part-row", "16");
+  await page.fill("#data-part-column", "16");
+  await page.press("#data-part-column", "Enter");
+  await page.waitForSelector("text=The measurement fits the calibration.");
+  await checks.look(page, "submit-window");
+  for (const name of ["row", "column", "height", "width"]) await page.fill(`#data-part-${name}`, "");
   await drop(page, data, "measurement.npy", scene.measurement);
+  await page.waitForSelector(".step:nth-child(2) .drop:has-text('measurement.npy: ')");
   await page.waitForSelector("text=The measurement fits the calibration.");
   for (const place of hurried) await page.unroute(place);
   checks.that(accepted > 0, "the form waits for checks that outlast their requests");
@@ -125,7 +135,7 @@ export async function watch(page, checks) {
 }
 
 /** Mean brightness of the left and right half of a pane. */
-export function brightness(page, pane = 1) {
+export function brightness(page, pane = 0) {
   return page.evaluate((pane) => {
     const canvas = document.querySelectorAll(".viewer .sight canvas")[pane];
     const { width, height } = canvas;
@@ -202,10 +212,11 @@ export async function view(page, checks, frames) {
   await page.keyboard.press("0");
   await page.waitForSelector("#zoom:text-is('fit')");
   for (const mode of ["difference", "residual"]) {
-    await shows(page, checks, 1, () => page.selectOption("#mode", mode), `the ${mode} map shows something`);
+    await shows(page, checks, 0, () => page.selectOption("#mode", mode), `the ${mode} map shows something`);
     await checks.look(page, `job-${mode}`);
   }
   await page.selectOption("#mode", "frame");
+  await curves(page, checks, frames);
   // Each frame is an EXR and a PNG. Add stack, array, manifest, TIFF, movie and ZIP.
   const status = (links) => Promise.all(links.map((link) => fetch(link.href, { method: "HEAD" }).then((answer) => answer.status)));
   const answers = await page.$$eval(".downloads a[download]:not([href$=gif])", status);
@@ -223,6 +234,48 @@ export async function view(page, checks, frames) {
   await page.waitForFunction(() => document.fullscreenElement?.classList.contains("viewer"));
   await page.click("#full");
   await page.waitForFunction(() => !document.fullscreenElement);
+}
+
+/** Reads pixels, the histogram and curves of the frames. */
+async function curves(page, checks, frames) {
+  const box = await (await page.$(PICTURE)).boundingBox();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  const [id, row, column] = [page.url().slice(-36), 360, 480];
+  const exact = await page.evaluate(async ([id, row, column]) => {
+    const answer = await fetch(`v1/jobs/${id}/snapshots/0/exports/npy`);
+    const bytes = await answer.arrayBuffer();
+    const start = 10 + new DataView(bytes).getUint16(8, true);
+    const values = new Float32Array(bytes.slice(start));
+    return Array.from({ length: 8 }, (_, frame) => values[(frame * 720 + row) * 960 + column]);
+  }, [id, row, column]);
+  const at = await frame(page);
+  await page.mouse.move(x + 1, y + 1);
+  const text = await checks.until(() => page.textContent("[aria-label=Frames] .readout"), (text) => /^Row 36\d, column 48\d: /.test(text), "the pointer shows row, column and value");
+  checks.that(/× full scale|counts/.test(text), `the value has a unit: ${text}`);
+  checks.that((await page.getAttribute("[aria-label=Frames] .histogram path", "d")).length > 100, "the contrast has a histogram");
+  await page.click("text=Curves and profiles");
+  await page.fill("#curve-row", String(row));
+  await page.fill("#curve-column", String(column));
+  await page.press("#curve-column", "Enter");
+  const link = ".probe a[download$='.csv']";
+  await page.waitForSelector(link);
+  const csv = async () => decodeURIComponent(await page.getAttribute(link, "href")).split("\r\n").slice(1, -1).map((line) => line.split(",").map(Number));
+  const curve = await csv();
+  checks.that(curve.length === frames && curve.every(([number, value], index) => number === index + 1 && Math.abs(value - exact[index]) < 1e-6), `the curve has the exact values, now at frame ${at}: ${JSON.stringify([curve, exact])}`);
+  for (const [kind, count] of [["region", frames], ["line", 101]]) {
+    await page.selectOption("#curve", kind);
+    for (const [id, value] of [["row", 300], ["column", 400], ["row-2", 300], ["column-2", 500]]) await page.fill(`#curve-${id}`, String(value));
+    await page.press("#curve-column-2", "Enter");
+    await checks.until(async () => ((await page.$(link)) ? (await csv()).length : 0), (length) => length === count, `the ${kind} has its values`);
+  }
+  // A drag draws the line on the picture.
+  await page.mouse.move(x - 50, y);
+  await page.mouse.down();
+  await page.mouse.move(x + 50, y + 20, { steps: 4 });
+  await page.mouse.up();
+  await checks.until(() => page.inputValue("#curve-row-2"), (text) => text !== "300", "a drag draws a line");
+  await checks.look(page, "job-curves");
+  await page.click("text=Curves and profiles");
 }
 
 /** Downloads a movie: the link shows the progress, and the browser plays the file. */
@@ -264,6 +317,15 @@ export async function compare(page, checks, labels, truth) {
   checks.that(groups[0] === "differs" && groups[1] === "same", `rows that differ come first: ${groups}`);
   await checks.look(page, "compare");
   const picture = () => page.$eval(".sight canvas", (canvas) => canvas.toDataURL());
+  const windows = () => page.$$eval(".contrasts .window", (all) => all.map((one) => one.textContent));
+  checks.that(new Set(await windows()).size === 1, `jobs of one scale share a contrast: ${await windows()}`);
+  await page.check("#match");
+  await page.$eval(".contrasts input", (slider) => {
+    slider.value = 200;
+    slider.dispatchEvent(new Event("input"));
+  });
+  checks.that(new Set(await windows()).size === 2, "with “Match scale” each job has its own contrast");
+  await page.uncheck("#match");
   const whole = await picture();
   await page.click("#wipe");
   await checks.until(async () => (await picture()) !== whole, Boolean, "the wipe overlays the other job");
@@ -310,6 +372,8 @@ export async function decided(page, checks, decision) {
 /** Submits the sample on an empty service, without typing. */
 export async function sample(page, checks) {
   await page.waitForSelector("text=One image in");
+  const loaded = await page.$eval(".coded", (box) => getComputedStyle(box).backgroundImage.includes("sample.webp"));
+  checks.that(loaded && (await page.$(".clip")) !== null, "the first screen shows a coded image and its frames");
   await checks.look(page, "empty");
   await page.click("#sample");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
@@ -325,9 +389,21 @@ export async function judged(page, checks, url, id) {
   checks.that((await page.textContent(".judgement")).length > 3, "the verdict has words, too");
   const expected = Number.parseFloat(await page.textContent(".quality:has-text('expected') b"));
   checks.that(Math.abs(expected - psnr) < 8, `the expected PSNR is close to the true one: ${expected}`);
-  await shows(page, checks, 1, () => page.selectOption("#mode", "error"), "the map of the expected error shows something");
+  await shows(page, checks, 0, () => page.selectOption("#mode", "error"), "the map of the expected error shows something");
   await checks.look(page, "job-error");
+  checks.that(/× full scale/.test(await page.textContent("[aria-label=Frames] .window")), "the bar under the error map has a unit");
   await page.selectOption("#mode", "frame");
+  const picture = await (await page.$(PICTURE)).boundingBox();
+  checks.that(Math.abs(picture.width / picture.height - 1) < 0.02, `the frame has the shape of the square picture: ${JSON.stringify(picture)}`);
+  const coded = await (await page.$("[aria-label=Measurement] .sight canvas")).boundingBox();
+  checks.that(coded.y + coded.height < 900 && picture.y + picture.height < 900, "frames and measurement are visible without scrolling");
+  checks.that(!(await page.isVisible(".tile")), "a single tile is not drawn");
+  // Every viewer sees the true frames that belong to the job.
+  const other = await checks.page(await page.context().browser().newContext());
+  await other.goto(page.url());
+  await other.waitForSelector(".quality:has-text('PSNR measured')");
+  checks.that((await other.$(".verdictcard .plot .line")) !== null, "another browser sees the measured PSNR and its curve");
+  await other.context().close();
   const before = await frame(page);
   await page.click("#play");
   await page.waitForFunction((before) => document.querySelector("#frame").value !== String(before), before);
@@ -364,9 +440,17 @@ export async function captures(page, checks, scene) {
   await page.waitForSelector("text=The measurement fits the calibration.");
   await page.selectOption("#algorithm", "gap-tv");
   await page.fill("#label", "from captures");
+  await page.click("summary:has-text('True frames')");
+  await page.setInputFiles("#truth", file("truth.npy", scene.truth));
+  await page.waitForSelector(".drop:has-text('truth.npy: ')");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
   await state(page, "succeeded");
+  await page.waitForSelector(".quality:has-text('PSNR measured')");
+  await page.click("text=Remove the true frames");
+  await page.click("dialog button.danger");
+  await page.waitForSelector(".verdictcard label:has-text('Attach true frames')");
+  checks.that((await page.$(".quality:has-text('PSNR measured')")) === null, "true frames can be removed from the job");
   const { pathname } = new URL(await page.$eval("a[href^='#/calibrations/']", (link) => `http://x/${link.getAttribute("href").slice(1)}`));
   return pathname;
 }
@@ -382,6 +466,7 @@ export async function manage(page, checks, label) {
   await page.waitForSelector(`${row} .badge.running`, { timeout: 60_000 });
   await page.click(`${row} button.cancel`);
   await page.waitForSelector(`${row} .badge.cancelled`, { timeout: 30_000 });
+  await page.click(`${row} button.more`);
   await page.click(`${row} button.delete`);
   await page.waitForSelector("dialog[open]");
   checks.that((await page.textContent("dialog")).includes(label), "the confirmation names the job");

@@ -12,7 +12,7 @@ import { HOSTILE, captures, colour, compare, decided, judged, manage, movie, net
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene } from "./scene.mjs";
-import { access, faults, loading, phone } from "./states.mjs";
+import { access, faults, loading, phone, reference } from "./states.mjs";
 
 const FRAMES = 8;
 const MOST_BYTES = 150_000;
@@ -58,6 +58,7 @@ async function everything() {
   await checks.step("movie in colour", () => movie(page, checks, [FRAMES, 192, 256]));
   await checks.step("phone", () => phone(browser, checks, service.url, id));
   await checks.step("loading", () => loading(browser, checks, service.url));
+  await checks.step("reference", () => reference(browser, checks, service.url));
   await service.submit(long(measurement, "long job"));
   await checks.step("manage", () => manage(page, checks, "long job"));
   checks.that((await page.textContent(`.list a >> text=${HOSTILE}`)) === HOSTILE, "the list shows the name as text");

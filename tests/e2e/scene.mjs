@@ -49,6 +49,15 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
       black: npy([height, width], new Float32Array(pixels).fill(BLACK)),
     }),
     measurement: npy([1, height, width], measurement),
+    /** A file with the snapshot `count` times. */
+    repeated: (count) => npy([count, height, width], Float32Array.from({ length: count * pixels }, (_, at) => measurement[at % pixels])),
+    /** The snapshot in the middle of a larger picture, with a border of this many pixels. */
+    framed: (border) => {
+      const wide = width + 2 * border;
+      const picture = new Float32Array((height + 2 * border) * wide).fill(0.5);
+      for (let row = 0; row < height; row += 1) picture.set(measurement.subarray(row * width, (row + 1) * width), (row + border) * wide + border);
+      return npy([1, height + 2 * border, wide], picture);
+    },
     /** A MATLAB file (level 5) with masks and snapshot under names of somebody's own. */
     matlab: () => mat([["patterns", [height, width, frames], masks], ["shots", [height, width], measurement]]),
     truth: npy([frames, height, width], truth),

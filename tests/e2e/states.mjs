@@ -1,5 +1,7 @@
 // States caused by faults, missing rights, small screens and slow answers.
 
+import { createServer, request as forward } from "node:http";
+import { join } from "node:path";
 import { scene } from "./scene.mjs";
 import { Service } from "./service.mjs";
 
@@ -11,7 +13,7 @@ export async function faults(browser, checks, program, services) {
   services.push(service);
   const [own, foreign] = [scene(8, 96, 128, 1), scene(8, 96, 128, 77)];
   const { calibration } = await service.take(own);
-  const data = await service.call("POST", "/v1/blobs", foreign.measurement);
+  const data = await service.call("POST", "/v1/blobs", foreign.repeated(3));
   const measurement = await service.call("POST", "/v1/measurements", { calibration, data: data.sha256, exposure_s: 0.1 });
   const bad = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "wrong masks" });
   await service.when(bad.id, (job) => job.state === "succeeded");
@@ -19,7 +21,9 @@ export async function faults(browser, checks, program, services) {
   await page.goto(`${service.url}/#/jobs/${bad.id}`);
   await page.waitForSelector(".judgement.bad, .judgement.usable");
   checks.that(/Bad|Doubtful/.test(await page.textContent(".judgement")), "the verdict warns");
-  checks.that((await page.textContent(".findings")).includes("What to do:"), "a finding shows its remedy");
+  const found = await page.$$eval(".verdictcard .findings li", (lines) => lines.map((line) => line.textContent));
+  checks.that(found.join().includes("What to do:"), "a finding shows its remedy");
+  checks.that(found.filter((line) => line.includes("3 snapshots (0 to 2)")).length > 0 && !found.some((line) => /Snapshot [012]:/.test(line)), `a finding of all snapshots is one line: ${found}`);
   await page.waitForSelector("text=10 times slower than real time");
   await page.click("text=True speed");
   await page.waitForSelector("text=in real time");
@@ -48,6 +52,7 @@ export async function faults(browser, checks, program, services) {
   await checks.look(page, "jobs-states");
   await page.click("text=damaged");
   await page.waitForSelector("h1:has-text('damaged')");
+  await page.click(".head button.more");
   await page.click("text=Rename");
   await page.fill("#new-name", "another name");
   await page.keyboard.press("Enter");
@@ -119,6 +124,8 @@ export async function phone(browser, checks, url, job) {
   const page = await checks.page(context);
   await page.goto(`${url}/#/jobs/${job}`);
   await page.waitForSelector(".downloads a");
+  // The measured PSNR comes last, and moves the frames down.
+  await page.waitForSelector(".quality:has-text('measured')");
   await page.$eval("[aria-label=Frames] .sight", (sight) => sight.scrollIntoView({ block: "center" }));
   await page.waitForTimeout(600);
   const wire = await context.newCDPSession(page);
@@ -162,4 +169,38 @@ export async function loading(browser, checks, url) {
   await page.waitForSelector(".calibration .grade.good");
   await checks.look(page, "calibrations");
   await page.context().close();
+}
+
+/** The API reference, directly and below the path prefix of a proxy. */
+export async function reference(browser, checks, url) {
+  const proxy = createServer((request, response) => {
+    const { pathname, search } = new URL(request.url, url);
+    if (!pathname.startsWith("/optics/")) return response.writeHead(404).end();
+    forward(`${url}${pathname.slice("/optics".length)}${search}`, { headers: request.headers }, (answer) => {
+      response.writeHead(answer.statusCode, answer.headers);
+      answer.pipe(response);
+    }).end();
+  });
+  await new Promise((resolve) => proxy.listen(0, "127.0.0.1", resolve));
+  for (const base of [url, `http://127.0.0.1:${proxy.address().port}/optics`]) {
+    const page = await checks.page(await browser.newContext(DESKTOP));
+    const strangers = [];
+    page.on("request", (request) => {
+      if (!request.url().startsWith(`${base}/`) && !/^(data|blob):/.test(request.url())) strangers.push(request.url());
+    });
+    await page.goto(`${base}/`);
+    await page.click("#nav >> text=API");
+    await page.waitForSelector("h1:has-text('sci-recon')");
+    await page.waitForSelector("h2:has-text('Submit a reconstruction')");
+    const text = await page.textContent("body");
+    checks.that(!text.includes("/view/") && !text.includes("/dashboard/"), "the reference shows public operations only");
+    checks.that(text.includes("tile"), "the reference shows the fields of requests");
+    await page.fill("[role=search] input", "cancel");
+    await page.waitForSelector("[data-role='search:results'] >> text=/cancel/i");
+    checks.that((await page.getAttribute("a[download]", "href")) === "openapi.yaml", "the reference links the contract");
+    checks.that(strangers.length === 0, `the reference loads files of this service alone: ${strangers}`);
+    await page.screenshot({ path: join(checks.folder, "reference.png") });
+    await page.context().close();
+  }
+  await new Promise((resolve) => proxy.close(resolve));
 }

@@ -7,10 +7,13 @@ import io
 import json
 import os
 import re
+import socket
 import sys
+import warnings
 from base64 import b64decode
 from pathlib import Path
 
+import httpx
 import npe2
 import numpy as np
 import sci_recon
@@ -27,7 +30,10 @@ def napari(result):
     folder = result.download("frames.npy", result.snapshots[0]).parent
     (folder / "manifest.json").write_text(json.dumps(result.manifest))
     url, job = os.environ["SCI_RECON_URL"], result.job
-    expected = {f"{url}/v1/jobs/{job.id}": result.frames, f"{url}/#/jobs/{job.id}": result.frames}
+    expected = {
+        f"{url}/v1/jobs/{job.id}": result.frames,
+        f"{url}/#/jobs/{job.id}": result.frames,
+    }
     expected[str(folder)] = result.snapshot(result.snapshots[0])
     for path, frames in expected.items():
         [(data, settings, kind)] = npe2.read([path], stack=False)
@@ -51,6 +57,23 @@ def jupyter(result):
     assert abs(picture.width / picture.height - width / height) < 0.02, picture
 
 
+def unreachable():
+    """A service that is down is named before the request is repeated."""
+    sci_recon._transfer.TRIES = 2
+    with (
+        warnings.catch_warnings(record=True) as issued,
+        Client("http://127.0.0.1:9") as client,
+    ):
+        warnings.simplefilter("always")
+        try:
+            list(client.jobs())
+            raise AssertionError("there is no service")
+        except sci_recon.SciReconError as error:
+            assert "127.0.0.1:9" in str(error), error
+    found = [str(warning.message) for warning in issued if warning.category is sci_recon.ConnectionWarning]
+    assert len(found) == 1 and "127.0.0.1:9" in found[0], issued
+
+
 def main():
     folder = Path(sys.argv[1])
     masks = np.load(folder / "masks.npy")
@@ -66,7 +89,10 @@ def main():
             assert difference < 0.05, f"snapshot {snapshot} does not fit its measurement: {difference}"
         stack = result.download("stack.exr", snapshot=1)
         assert stack.read_bytes()[:4] == bytes([0x76, 0x2F, 0x31, 0x01])
-        error, blocks = result.expected_error(1), np.load(result.download("error.npy", snapshot=1))
+        error, blocks = (
+            result.expected_error(1),
+            np.load(result.download("error.npy", snapshot=1)),
+        )
         k, i, j = np.indices(result.snapshot(1).shape)
         assert (error == blocks[k, i // 16, j // 16]).all()
         assert result.assessment == client.job(result.job.id).record["assessment"] is not None
@@ -76,9 +102,21 @@ def main():
         assert not list(stack.parent.glob("*.part"))
         assert result.manifest["content"]["schedule"]
         text = repr(result)
-        assert result.job.verdict in text and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text, text
+        assert result.job.verdict in text and f"{len(frames)} frames of {frames.shape[1]}x{frames.shape[2]}" in text, (
+            text
+        )
         napari(result)
         jupyter(result)
+        assert result.download("stack.tif", snapshot=1).read_bytes()[:2] == b"II"
+        with warnings.catch_warnings(record=True) as issued:
+            warnings.simplefilter("always")
+            wrong = client.reconstruct(masks[:, ::-1], measurement, "gap-tv")
+        found = [str(warning.message) for warning in issued if warning.category is sci_recon.FindingWarning]
+        assert found and all("Remedy: " in text for text in found), issued
+        assert len({text.split(":")[0] for text in found}) == len(found), "a line for each finding"
+        code = wrong.job.findings[0]["code"]
+        assert code in found[0] and code in repr(wrong) and code in wrong._repr_html_(), (found, wrong)
+        wrong.job.delete()
         # A rejection raises the service's message, without a retry.
         try:
             client.reconstruct(masks * 3, measurement, "gap-tv")
@@ -88,7 +126,8 @@ def main():
             assert str(error).count("above the full scale") == 1, error
         # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
-        assert later.state == "succeeded" and [job.id for job in client.jobs()] == [later.id]
+        assert later.state == "succeeded" and later.id in [job.id for job in client.jobs()]
+        unreachable()
         print(json.dumps({"job": later.id, "frames": list(frames.shape)}))
 
 

@@ -462,6 +462,7 @@ def refused():
     row = "`.mat` 7.3 with a struct"
     with level73(path(row, "in.mat", reason="missing_array", again={"name": "mask/data"})) as file:
         file.create_dataset("mask/data", data=np.moveaxis(MASKS, 0, -1).T).attrs["MATLAB_class"] = np.bytes_("double")
+        file["mask/exposure"] = np.ones((1, 1))
         file["mask"].attrs["MATLAB_class"] = np.bytes_("struct")
     row = "integers without a stated full scale"
     np.save(path(row, "in.npy", measurement=True, reason="invalid_full_scale", again={"full_scale": 250}), SNAPSHOTS.astype("<i4"))

@@ -8,13 +8,15 @@ use serde_json::{Value, json};
 use crate::app::{TestApp, id};
 use crate::samples::Scene;
 
-const PUBLIC: [&str; 7] = [
+const PUBLIC: [&str; 9] = [
     "/livez",
     "/readyz",
     "/openapi.yaml",
     "/openapi.json",
     "/",
     "/dashboard/{file}",
+    "/docs",
+    "/docs/{file}",
     "/problems/{code}",
 ];
 

@@ -291,9 +291,6 @@ async fn concatenation_is_refused_and_a_stalled_piece_is_cut() {
     let part = begin().header("upload-length", "3").header("upload-concat", "partial");
     let detail = app.send(part).await.problem(400, "malformed_request");
     assert!(detail.contains("parallelUploads"), "{detail}");
-    let deferred = begin().header("upload-defer-length", "1");
-    let detail = app.send(deferred).await.problem(400, "malformed_request");
-    assert!(detail.contains("Upload-Length"), "{detail}");
     let created = app.send(begin().header("upload-length", "10")).await.expect(201);
     let place = created.header("location").to_owned();
     let mut socket = TcpStream::connect(app.address()).await.unwrap();
@@ -311,6 +308,51 @@ async fn concatenation_is_refused_and_a_stalled_piece_is_cut() {
     assert!(answer.is_empty(), "{}", String::from_utf8_lossy(&answer));
     let head = app.request(Method::HEAD, &place).header("tus-resumable", "1.0.0");
     assert_eq!(app.send(head).await.expect(200).header("upload-offset"), "3");
+}
+
+#[tokio::test]
+async fn every_answer_restricts_browsers() {
+    let app = TestApp::start().await;
+    let paths = [
+        "/",
+        "/dashboard/main.js",
+        "/docs",
+        "/livez",
+        "/v1/me",
+        "/v1/nothing",
+        "/problems/too_large",
+    ];
+    for path in paths {
+        let answer = app.get(path).await;
+        assert_eq!(answer.header("x-content-type-options"), "nosniff", "{path}");
+        assert_eq!(answer.header("referrer-policy"), "no-referrer", "{path}");
+        let policy = answer.header("content-security-policy");
+        assert!(policy.contains("frame-ancestors 'none'"), "{path}: {policy}");
+    }
+}
+
+#[tokio::test]
+async fn log_lines_name_the_trace_of_the_caller() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("log");
+    let app = TestApp::logging(&log, "info", &["--workers", "0", "--log-format", "json"]).await;
+    let (trace, parent) = ("4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7");
+    let request = app.request(Method::POST, "/v1/blobs").header("x-request-id", "traced");
+    let request = request.header("traceparent", format!("00-{trace}-{parent}-01"));
+    app.send(request.body("abc")).await.expect(201);
+    app.send(app.request(Method::POST, "/v1/blobs").header("x-request-id", "alone").body("abc"))
+        .await;
+    let lines = std::fs::read_to_string(&log).unwrap();
+    let line = |id: &str| {
+        let mut lines = lines.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        let answered =
+            |line: &Value| line["span"]["id"] == id && line["fields"]["message"] == "answered";
+        lines.find(answered).unwrap_or_else(|| panic!("{id}"))
+    };
+    assert_eq!(line("traced")["span"]["trace_id"], trace);
+    assert_eq!(line("traced")["span"]["parent_id"], parent);
+    assert_eq!(line("traced")["span"]["lab"], "local");
+    assert_eq!(line("alone")["span"]["trace_id"], Value::Null);
 }
 
 #[tokio::test]

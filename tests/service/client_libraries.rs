@@ -73,20 +73,22 @@ async fn python_watches_a_folder() {
     std::fs::write(path("masks.npy"), Scene::SMALL.masks()).unwrap();
     std::fs::write(path("drop.npy"), Scene::SMALL.snapshots()).unwrap();
     std::fs::write(path("small.npy"), constant(&[1, 8, 8], 0.5)).unwrap();
-    for _ in 0..2 {
+    for status in [1, 0] {
         let mut watch = tokio::process::Command::new(&python);
         watch.env("PYTHONPATH", "clients/python/src");
         watch.env("SCI_RECON_URL", format!("http://{}", app.address()));
         watch.args(["-m", "sci_recon", "watch", "--algorithm=gap-tv", "--once"]);
         watch.args(["--settle-seconds=0.1", "--masks"]).arg(path("masks.npy")).arg(folder.path());
         let output = watch.output().await.unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(status), "a file failed in the first run: {errors}");
     }
     let report = std::fs::read_to_string(path("drop.npy.result/REPORT.txt")).unwrap();
     let jobs = app.get("/v1/jobs").await.expect(200).json();
     assert_eq!(jobs["items"].as_array().unwrap().len(), 1, "{jobs}");
     assert!(report.contains(jobs["items"][0]["id"].as_str().unwrap()), "{report}");
     assert!(path("drop.npy.result/snapshot_0000/frames.npy").exists());
+    assert!(path("drop.npy.result/snapshot_0000/stack.tif").exists());
     let reason = std::fs::read_to_string(path("small.npy.failed.txt")).unwrap();
     assert!(reason.contains("size_mismatch"), "{reason}");
     assert!(!path("drop.npy.2.result").exists() && !path("small.npy.2.failed.txt").exists());

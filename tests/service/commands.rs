@@ -283,6 +283,7 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     let errors = stderr.lines().filter(|line| line.starts_with("error ")).count();
     assert!(errors > 0 && stderr.matches("Remedy: ").count() >= errors, "{stderr}");
     assert!(stderr.contains("the checks found"), "{stderr}");
+    assert!(!stderr.contains("`axes`") && !stderr.contains("`full_scale`"), "{stderr}");
     let job = String::from_utf8(submitted.stdout).unwrap().trim().to_owned();
 
     let watched = lab.run(&["watch", &job]).await;
@@ -300,12 +301,19 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     std::fs::create_dir(lab.path("bench")).unwrap();
     lab.write("bench/oops.npy", &SCENE.masks());
     let watch = ["watch-folder", "bench", "--once", "--settle-seconds", "0.1"];
-    let watched = lab.run(&[&watch[..], &masks, &["--file", "manifest.json"]].concat()).await;
+    let exec = "echo \"$JOB_STATE $JOB_FILE $JOB_RESULTS\" >> ended";
+    let options = ["--file", "manifest.json", "--exec", exec];
+    let watched = lab.run(&[&watch[..], &masks, &options].concat()).await;
     let text = String::from_utf8(watched.stdout).unwrap();
     assert_eq!(watched.status.code(), Some(3), "{text}");
     assert!(
         text.contains("    error ") && text.contains("oops.npy is in oops.npy.result"),
         "{text}"
+    );
+    let ended = std::fs::read_to_string(lab.path("ended")).unwrap();
+    assert!(
+        ended.starts_with("succeeded /") && ended.ends_with("bench/oops.npy.result\n"),
+        "{ended}"
     );
     let report = std::fs::read_to_string(lab.path("bench/oops.npy.result/REPORT.txt")).unwrap();
     assert!(report.starts_with("oops.npy: bad") && report.contains("\nerror "), "{report}");
@@ -381,7 +389,7 @@ async fn arrays_can_have_any_name() {
     lab.write("plain.npy", &Scene::SMALL.snapshots());
     let line = [&["submit", "plain.npy", "--array", "shots"][..], &masks, &scale].concat();
     let refused = lab.refused(2, &line).await;
-    assert!(refused.contains("omit `array`"), "{refused}");
+    assert!(refused.contains("omit `--array`"), "{refused}");
 }
 
 /// Adds 50 files, two of them equal, while the watcher is killed repeatedly.

@@ -1,5 +1,6 @@
 //! The service against its contract, and its monitoring.
 
+use std::io::Read;
 use std::sync::LazyLock;
 
 use reqwest::Method;
@@ -94,6 +95,41 @@ async fn the_contract_is_served_and_its_references_resolve() {
         let value = path.split('/').fold(&contract, |at, key| &at[key]);
         assert!(!value.is_null(), "{path} leads nowhere");
     }
+}
+
+#[tokio::test]
+async fn the_reference_loads_its_files_from_the_service_alone() {
+    let app = TestApp::start().await;
+    let page = app.get("/docs").await.expect(200);
+    let policy = page.header("content-security-policy").to_owned();
+    assert!(policy.contains("script-src 'self'; style-src 'unsafe-inline'"), "{policy}");
+    // No other page has this exception.
+    assert!(!app.get("/").await.header("content-security-policy").contains("unsafe-inline"));
+    let text = String::from_utf8(page.bytes).unwrap();
+    let addresses = text.split("=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
+    let scripts: Vec<&str> = addresses.filter(|address| address.ends_with(".js")).collect();
+    assert_eq!(
+        scripts,
+        ["docs/redoc.js", "docs/start.js"],
+        "relative, so that a proxy may add a prefix"
+    );
+    for script in scripts {
+        let path = format!("/{script}");
+        let plain = app.get(&path).await.expect(200);
+        assert!(plain.header("content-type").starts_with("text/javascript"), "{path}");
+        let packed = app.request(Method::GET, &path).header("accept-encoding", "gzip");
+        let packed = app.send(packed).await.expect(200);
+        assert_eq!(packed.header("content-encoding"), "gzip", "{path}");
+        let mut unpacked = Vec::new();
+        flate2::read::GzDecoder::new(&packed.bytes[..]).read_to_end(&mut unpacked).unwrap();
+        assert_eq!(unpacked, plain.bytes, "{path}");
+        assert_ne!(plain.header("etag"), packed.header("etag"), "{path}");
+    }
+    let script = String::from_utf8(app.get("/docs/redoc.js").await.bytes).unwrap();
+    assert!(script.contains("2.5.4") && !script.contains("cdn.redoc"));
+    let licence = app.get("/docs/LICENSE.txt").await.expect(200);
+    assert!(String::from_utf8_lossy(&licence.bytes).contains("The MIT License"));
+    app.get("/docs/nothing.js").await.problem(404, "not_found");
 }
 
 #[tokio::test]

@@ -12,7 +12,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 
 use crate::app::{Answer, TestApp, id, judges};
-use crate::samples::{npy, npy_header};
+use crate::samples::{Scene, npy, npy_header};
 
 /// A table row: its first cell, and its command if there is one.
 type Row = (String, Option<String>);
@@ -326,4 +326,50 @@ async fn windows_and_ranges_select_the_part_that_masks_and_snapshots_share() {
     assert!(refused.problem(422, "size_mismatch").contains("`frames`"));
     body["frames"] = json!([60, 67]);
     assert_eq!(app.post("/v1/calibrations", &body).await.expect(201).json()["frames"], 8);
+}
+
+/// Darks in files of one array are read whatever its name; several arrays are listed with the options that select one.
+#[tokio::test]
+async fn the_only_array_of_a_file_needs_no_name() {
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let script = "import h5py, numpy, scipy.io, sys
+dark, masks = numpy.full((2, 48, 64), 0.01, 'f4'), numpy.load('masks.npy')
+scipy.io.savemat('dark.mat', {'black_level': dark.transpose(1, 2, 0)}, do_compression=True)
+h5py.File('dark.h5', 'w')['entry/black_level'] = dark
+numpy.savez('dark.npz', black_level=dark)
+scipy.io.savemat('several.mat', {'a': dark[0], 'b': dark[1]})
+scipy.io.savemat('masks.mat', {'codes': masks.transpose(1, 2, 0), 'other': masks[0]})
+";
+    std::fs::write(folder.path().join("masks.npy"), Scene::SMALL.masks()).unwrap();
+    let mut write = tokio::process::Command::new(python);
+    let written = write.args(["-c", script]).current_dir(&folder).status().await.unwrap();
+    assert!(written.success());
+    let read = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    let calibration = id(&app.calibrate(Scene::SMALL.masks()).await);
+    let data = app.upload(Scene::SMALL.snapshots()).await;
+    for file in ["dark.mat", "dark.h5", "dark.npz"] {
+        let dark = app.upload(read(file)).await;
+        let body = json!({"calibration": calibration, "data": data, "dark": [dark]});
+        app.post("/v1/measurements", &body).await.expect(201);
+    }
+    let dark = app.upload(read("several.mat")).await;
+    let body = json!({"calibration": calibration, "data": data, "dark": [dark]});
+    let answer = app.post("/v1/measurements", &body).await;
+    let detail = answer.problem(422, "invalid_content");
+    assert!(detail.contains("'a', 'b'") && detail.contains("save the array alone"), "{detail}");
+
+    let run = |masks: &str, more: &[&str]| {
+        let mut reconstruct = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        reconstruct.args(["reconstruct", "--masks", masks, "--measurement", "y.npy"]);
+        reconstruct.args(["--algorithm", "gap-tv", "--iterations", "3"]).args(more);
+        reconstruct.current_dir(&folder).output().unwrap()
+    };
+    std::fs::write(folder.path().join("y.npy"), Scene::SMALL.snapshots()).unwrap();
+    let output = run("masks.mat", &[]);
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(text.contains("'codes', 'other'") && text.contains("--masks-array"), "{text}");
+    let output = run("masks.mat", &["--masks-array", "codes", "--dark", "dark.mat"]);
+    assert!([Some(0), Some(3)].contains(&output.status.code()), "{output:?}");
 }

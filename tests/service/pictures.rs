@@ -56,6 +56,15 @@ async fn images_show_the_frames_unchanged() {
     let known = app.request(Method::GET, &address).header("if-none-match", tile.header("etag"));
     app.send(known).await.expect(304);
 
+    // The values of the same tile are exact.
+    let address = format!("{pictures}/frame-2/values/0/0/0");
+    let exact = app.get(&address).await.expect(200);
+    let expected: Vec<u8> =
+        frames[plane..2 * plane].iter().flat_map(|value| value.to_le_bytes()).collect();
+    assert_eq!(exact.bytes[..], expected[..]);
+    let known = app.request(Method::GET, &address).header("if-none-match", exact.header("etag"));
+    app.send(known).await.expect(304);
+
     // A preview is reduced by a power of two; a slice has one row of every frame.
     let small = app.get(&format!("{pictures}/frame-1?size=32&black=0&white=1")).await.expect(200);
     let (rows, columns, shown) = decode(&small);
@@ -95,6 +104,9 @@ async fn images_show_the_frames_unchanged() {
         (format!("{measured}/snapshot-2"), 404, "not_found"),
         (format!("{pictures}/frame-1/tiles/0/1/0?black=0&white=1"), 404, "not_found"),
         (format!("{pictures}/frame-1/tiles/1/0/0?black=0&white=1"), 404, "not_found"),
+        (format!("{pictures}/frame-1/values/0/0/1"), 404, "not_found"),
+        (format!("{measured}/snapshot-2/values/0/0/0"), 404, "not_found"),
+        (format!("{masks}/mask-5/values/0/0/0"), 404, "not_found"),
         (format!("{pictures}/frame-1/tiles/0/0/0"), 400, "invalid_query"),
         (format!("{pictures}/frame-1/tiles/0/0/0?black=1&white=1"), 400, "invalid_query"),
         (format!("{pictures}/frame-1/tiles/0/0/0?black=NaN&white=1"), 400, "invalid_query"),
@@ -138,7 +150,48 @@ async fn frames_are_compared_with_a_known_truth() {
     let three = app.upload(crate::samples::constant(&[3, 48, 64], 0.5)).await;
     app.get(&format!("{path}{three}")).await.problem(422, "size_mismatch");
     app.get(&format!("{path}{}", "0".repeat(64))).await.problem(404, "not_found");
-    app.get(path.trim_end_matches("?truth=")).await.problem(400, "invalid_query");
+    let own = path.trim_end_matches("?truth=");
+    app.get(own).await.problem(400, "invalid_query");
+
+    // Attached to the job, the true frames hold for every reader, and the file is kept.
+    let address = format!("/v1/jobs/{job}");
+    assert_eq!(app.get(&address).await.json()["truth"], Value::Null);
+    let attach = |truth: Value| app.request(Method::PATCH, &address).json(&json!({"truth": truth}));
+    let attached = app.send(attach(json!(all_snapshots))).await.expect(200).json();
+    assert_eq!(attached["truth"], json!(all_snapshots));
+    assert_eq!(app.get(own).await.expect(200).json()["psnr"], quality["psnr"]);
+    let upload = format!("/v1/blobs/{all_snapshots}");
+    app.send(app.request(Method::DELETE, &upload)).await.problem(409, "in_use");
+    for (unfit, code) in
+        [(json!(three), "size_mismatch"), (json!("0".repeat(64)), "invalid_request")]
+    {
+        let refused = app.send(attach(unfit)).await;
+        refused.problem(422, code);
+        assert_eq!(refused.json()["errors"][0]["pointer"], "/truth");
+    }
+    assert_eq!(app.send(attach(Value::Null)).await.expect(200).json()["truth"], Value::Null);
+    app.send(app.request(Method::DELETE, &upload)).await.expect(204);
+}
+
+#[tokio::test]
+async fn the_truth_of_a_request_belongs_to_the_job_and_its_manifest() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let truth = app.upload(crate::samples::constant(&[4, 48, 64], 0.5)).await;
+    let mut body = json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 0,
+        "schedule": tv(4, 2), "truth": truth});
+    let job = app.submit(&body).await;
+    assert_eq!(app.ended(&job).await["truth"], json!(truth));
+    let manifest = app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
+    assert_eq!(manifest["run"]["truth_sha256"], json!(truth));
+    let quality = app.get(&format!("/v1/jobs/{job}/snapshots/0/quality")).await.expect(200).json();
+    assert_eq!(quality["truth"], json!(truth));
+    body["truth"] = json!(app.upload(crate::samples::constant(&[4, 48, 63], 0.5)).await);
+    let refused = app.post("/v1/jobs", &body).await;
+    refused.problem(422, "size_mismatch");
+    assert_eq!(refused.json()["errors"][0]["pointer"], "/truth");
+    app.send(app.request(Method::DELETE, &format!("/v1/jobs/{job}"))).await.expect(204);
+    app.send(app.request(Method::DELETE, &format!("/v1/blobs/{truth}"))).await.expect(204);
 }
 
 #[tokio::test]

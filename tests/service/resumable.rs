@@ -50,7 +50,10 @@ async fn pieces_are_joined_to_a_blob() {
     let mut app = TestApp::start().await;
     let options = app.send(app.request(Method::OPTIONS, "/v1/uploads")).await.expect(204);
     assert_eq!(options.header("tus-version"), "1.0.0");
-    assert_eq!(options.header("tus-extension"), "creation,checksum,expiration,termination");
+    assert_eq!(
+        options.header("tus-extension"),
+        "creation,creation-defer-length,checksum,expiration,termination"
+    );
     assert_eq!(options.header("tus-checksum-algorithm"), "sha1,sha256");
     let path = begin(&app, 3, &format!("filename YQ==,sha256 {ABC_BASE64}")).await;
     assert_eq!(
@@ -75,6 +78,76 @@ async fn pieces_are_joined_to_a_blob() {
     app.send(tus(&app, Method::HEAD, &path)).await.expect(404);
     app.get(&format!("/v1/blobs/{ABC}")).await.expect(200);
     assert_eq!(std::fs::read_dir(app.data().join("partial")).unwrap().count(), 0);
+}
+
+#[tokio::test]
+async fn a_later_piece_states_the_length() {
+    let mut app = TestApp::start().await;
+    let defer =
+        |app: &TestApp| tus(app, Method::POST, "/v1/uploads").header("upload-defer-length", 1);
+    let both = defer(&app).header("upload-length", 3);
+    app.send(both).await.problem(400, "malformed_request");
+    let request = defer(&app).header("upload-metadata", format!("sha256 {ABC_BASE64}"));
+    let path = app.send(request).await.expect(201).header("location").to_owned();
+    app.send(piece(&app, &path, 0, b"a")).await.expect(204);
+    app.send(piece(&app, &path, 1, b"b")).await.expect(204);
+    app.restart();
+    let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
+    assert_eq!(known.header("upload-defer-length"), "1");
+    assert_eq!((known.header("upload-length"), known.header("upload-offset")), ("", "2"));
+    let list = app.get("/v1/uploads").await.expect(200).json();
+    assert_eq!(list["items"][0]["length"], Value::Null);
+    // A length below the number of received bytes is refused, and nothing is recorded.
+    for length in ["1", "0", "x"] {
+        let last = piece(&app, &path, 2, b"c").header("upload-length", length);
+        assert_eq!(app.send(last).await.status, 400, "{length}");
+    }
+    let long = piece(&app, &path, 2, b"c").header("upload-length", 1u64 << 40);
+    app.send(long).await.problem(413, "too_large");
+    let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
+    assert_eq!((known.header("upload-length"), known.header("upload-offset")), ("", "2"));
+    // The last piece states the length, which can't change then.
+    let stated = piece(&app, &path, 2, b"").header("upload-length", 3);
+    app.send(stated).await.expect(204);
+    let other = piece(&app, &path, 2, b"c").header("upload-length", 4);
+    app.send(other).await.problem(400, "malformed_request");
+    let known = app.send(tus(&app, Method::HEAD, &path)).await.expect(200);
+    assert_eq!((known.header("upload-length"), known.header("upload-defer-length")), ("3", ""));
+    app.send(piece(&app, &path, 2, b"cd")).await.problem(413, "too_large");
+    let last = app.send(piece(&app, &path, 2, b"c").header("upload-length", 3)).await.expect(204);
+    assert_eq!(last.header("content-location"), format!("/v1/blobs/{ABC}"));
+    // All has come before the length is stated.
+    let path = app.send(defer(&app)).await.expect(201).header("location").to_owned();
+    app.send(piece(&app, &path, 0, b"abc")).await.expect(204);
+    let last = app.send(piece(&app, &path, 3, b"").header("upload-length", 3)).await.expect(204);
+    assert!(last.header("content-location").ends_with(ABC));
+}
+
+#[tokio::test]
+async fn limits_hold_for_uploads_of_unknown_length() {
+    let app = TestApp::with(&["--workers", "0", "--max-upload-bytes", "1000000"]).await;
+    let token = app.token(&["create", "--lab", "a", "--max-bytes", "600000"]);
+    app.sign_in(&token);
+    let begin = async || {
+        let request = tus(&app, Method::POST, "/v1/uploads").header("upload-defer-length", 1);
+        app.send(request).await
+    };
+    let path = begin().await.expect(201).header("location").to_owned();
+    let bytes: &'static [u8] = vec![7; 500_000].leak();
+    app.send(piece(&app, &path, 0, bytes)).await.expect(204);
+    // The bytes that have come count, and so do those of other uploads.
+    app.send(piece(&app, &path, 500_000, bytes)).await.problem(403, "quota_exceeded");
+    assert_eq!(offset(&app, &path).await, "500000");
+    let length = piece(&app, &path, 500_000, b"").header("upload-length", 700_000);
+    app.send(length).await.problem(403, "quota_exceeded");
+    let length = piece(&app, &path, 500_000, b"").header("upload-length", 600_000);
+    app.send(length).await.expect(204);
+    begin().await.problem(403, "quota_exceeded");
+    // The limit on the size of an upload.
+    app.sign_in(&app.token(&["create", "--lab", "b"]));
+    let path = begin().await.expect(201).header("location").to_owned();
+    let bytes: &'static [u8] = vec![7; 1_000_001].leak();
+    app.send(piece(&app, &path, 0, bytes)).await.problem(413, "too_large");
 }
 
 #[tokio::test]
@@ -107,7 +180,7 @@ async fn requests_that_violate_tus_are_rejected() {
         ("upload-length", "1e3"),
         ("upload-length", "99999999999999999999"),
         ("upload-length", "0"),
-        ("upload-defer-length", "1"),
+        ("upload-defer-length", "2"),
     ] {
         let request = tus(&app, Method::POST, "/v1/uploads").header(name, value);
         assert_eq!(app.send(request).await.status, 400, "{name}: {value}");

@@ -12,7 +12,8 @@ pub struct Scene {
 impl Scene {
     pub const SMALL: Self = Self { frames: 4, height: 48, width: 64, snapshots: 2 };
 
-    fn mask(self, frame: usize, row: usize, column: usize) -> f32 {
+    /// A mask's pixel, open or closed.
+    pub fn mask(self, frame: usize, row: usize, column: usize) -> f32 {
         // A hash of the position opens half of the pixels.
         let mut state = (frame * 7919 + row * 104_729 + column * 1_299_709 + 1) as u64;
         state = (state ^ (state >> 15)).wrapping_mul(0x2c1b_3c6d_9e37_79b9);

@@ -1,5 +1,7 @@
 //! Uploads in one request.
 
+use std::time::Duration;
+
 use reqwest::{Body, Method, multipart};
 use serde_json::json;
 
@@ -110,19 +112,38 @@ async fn too_many_concurrent_uploads_are_asked_to_retry() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let app = TestApp::with(&["--workers", "0", "--max-uploads", "1"]).await;
     let address = app.address();
-    let mut socket = tokio::net::TcpStream::connect(&address).await.unwrap();
     let head = format!(
         "POST /v1/blobs HTTP/1.1\r\nHost: {address}\r\nContent-Length: 10\r\n\
          Expect: 100-continue\r\n\r\n"
     );
-    socket.write_all(head.as_bytes()).await.unwrap();
-    // The server requests the body when the upload has the only place.
-    let mut answer = vec![0; 12];
-    socket.read_exact(&mut answer).await.unwrap();
-    assert_eq!(answer, b"HTTP/1.1 100", "{}", String::from_utf8_lossy(&answer));
-    let second = app.send(app.request(Method::POST, "/v1/blobs").body("abc")).await;
-    second.problem(429, "too_many_uploads");
-    assert_eq!(second.header("retry-after"), "5");
+    let begin = async || {
+        let mut socket = tokio::net::TcpStream::connect(&address).await.unwrap();
+        socket.write_all(head.as_bytes()).await.unwrap();
+        // The server requests the body when the upload has the only place.
+        let mut answer = vec![0; 12];
+        socket.read_exact(&mut answer).await.unwrap();
+        assert_eq!(answer, b"HTTP/1.1 100", "{}", String::from_utf8_lossy(&answer));
+        socket
+    };
+    let refused = async || {
+        let second = app.send(app.request(Method::POST, "/v1/blobs").body("abc")).await;
+        second.problem(429, "too_many_uploads");
+        second.header("retry-after").parse::<u64>().unwrap()
+    };
+    let mut first = begin().await;
+    assert_eq!(refused().await, 5, "no upload has ended yet");
+    tokio::time::sleep(Duration::from_secs(7)).await;
+    first.write_all(b"0123456789").await.unwrap();
+    let (mut answer, mut part) = (String::new(), vec![0; 1000]);
+    while !answer.contains("HTTP/1.1 201") {
+        let count = first.read(&mut part).await.unwrap();
+        assert!(count > 0, "{answer}");
+        answer += &String::from_utf8_lossy(&part[..count]);
+    }
+    // The estimate follows the time that the first upload took.
+    let _second = begin().await;
+    let seconds = refused().await;
+    assert!((7..30).contains(&seconds), "{seconds}");
 }
 
 /// The server's memory stays below 200 MiB while a 600 MB mask stack is uploaded and checked.

@@ -33,7 +33,7 @@ fn reconstruct(masks: &[f32], y: &[f32]) -> (Value, Vec<String>) {
     std::fs::write(path("y.npy"), npy(&[SIDE, SIDE], y.iter().copied())).unwrap();
     let output = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
         .args(["reconstruct", "--masks", "masks.npy", "--measurement", "y.npy", "--json"])
-        .args(["--algorithm", "gap-tv", "--iterations", "60"])
+        .args(["--algorithm", "gap-tv", "--iterations", "60", "--registration", "off"])
         .current_dir(folder.path())
         .output()
         .unwrap();
@@ -52,6 +52,15 @@ fn the_right_input_has_a_figure_and_no_finding_on_the_masks() {
     assert_eq!(codes, Vec::<String>::new());
     assert!(assessment["psnr_db"].is_number(), "{assessment}");
     assert_eq!(assessment["order"], "consistent");
+}
+
+#[test]
+fn inverted_masks_are_named_first() {
+    let (masks, y) = scene();
+    let inverted: Vec<f32> = masks.iter().map(|mask| 1.0 - mask).collect();
+    let (assessment, codes) = reconstruct(&inverted, &y);
+    assert_eq!(codes[0], "inverted_masks", "{codes:?}");
+    assert_eq!(assessment["psnr_db"], Value::Null, "{assessment}");
 }
 
 #[test]

@@ -56,16 +56,28 @@ const MAX_DEPTH: usize = 16;
 const MAX_GROUPS: usize = 256;
 const MAX_LISTED: usize = 1024;
 
-/// Opens the array with this name; `array` is its role. Errors: malformed files; [`FormatError::MissingArray`];
-/// [`FormatError::OverLimit`]; [`FormatError::Unsupported`]; [`FormatError::AxesAmbiguous`].
-pub(super) fn open(
-    file: File,
-    (array, name, expected): (SceneArray, &str, &Expected),
-    limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
-    let mut advice = Advice { name: python_name(name) };
+/// The paths of the arrays in the file; a variable of Octave is one array. Errors: as [`open`].
+pub(super) fn names(file: File) -> Result<Vec<String>> {
+    let advice = Advice { name: python_name("array") };
     let error = |source| advice.error(source);
-    let storage: DynStorage = Arc::new(FileStorage::from_file(file).map_err(error)?);
+    let file = open_file(file).map_err(error)?;
+    let mut paths = array_paths(&file.root_group().map_err(error)?);
+    let values = paths.iter().filter_map(|path| path.strip_suffix("/value"));
+    let variables: Vec<String> = values
+        .filter(|group| paths.iter().any(|path| path.strip_suffix("/type") == Some(group)))
+        .map(str::to_owned)
+        .collect();
+    let is_part = |path: &String| {
+        path.rsplit_once('/').is_some_and(|(group, _)| variables.iter().any(|name| name == group))
+    };
+    paths.retain(|path| !is_part(path));
+    paths.extend(variables);
+    Ok(paths)
+}
+
+/// Opens a file with the filters that it may need.
+fn open_file(file: File) -> std::result::Result<Hdf5File, Error> {
+    let storage: DynStorage = Arc::new(FileStorage::from_file(file)?);
     let mut filters = FilterRegistry::new();
     let max_bytes = CHUNK_CACHE_BYTES;
     filters.register(
@@ -79,7 +91,19 @@ pub(super) fn open(
         filter_registry: Some(filters),
         ..OpenOptions::default()
     };
-    let file = Hdf5File::from_storage_with_options(storage, options).map_err(error)?;
+    Hdf5File::from_storage_with_options(storage, options)
+}
+
+/// Opens the array with this name; `array` is its role. Errors: malformed files; [`FormatError::MissingArray`];
+/// [`FormatError::OverLimit`]; [`FormatError::Unsupported`]; [`FormatError::AxesAmbiguous`].
+pub(super) fn open(
+    file: File,
+    (array, name, expected): (SceneArray, &str, &Expected),
+    limits: &Limits,
+) -> Result<Box<dyn FrameReader + Send>> {
+    let mut advice = Advice { name: python_name(name) };
+    let error = |source| advice.error(source);
+    let file = open_file(file).map_err(error)?;
     let root = file.root_group().map_err(error)?;
     let Found { dataset, octave } = find(&root, name).map_err(error)?.ok_or_else(|| {
         let (format, name) = (Format::Hdf5, name.to_owned());

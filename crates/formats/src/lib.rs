@@ -30,7 +30,7 @@ mod tar;
 mod window;
 mod zip;
 
-pub mod bigtiff;
+pub mod clip_tiff;
 pub mod exr;
 pub mod gif;
 pub mod mat;

@@ -34,13 +34,7 @@ impl Limits {
     }
 
     /// Checks a claimed shape. Errors: [`FormatError::OverLimit`]; [`FormatError::Malformed`] for an empty axis.
-    pub(super) fn check_shape(
-        &self,
-        format: Format,
-        frames: u64,
-        height: u64,
-        width: u64,
-    ) -> Result<()> {
+    pub fn check_shape(&self, format: Format, frames: u64, height: u64, width: u64) -> Result<()> {
         if frames == 0 || height == 0 || width == 0 {
             return Err(FormatError::malformed(
                 format,

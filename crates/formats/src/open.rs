@@ -11,6 +11,7 @@ use ndarray::Array3;
 use super::format::{HDF5_MAGIC, HEAD_BYTES, describe};
 use super::mat::{self, SceneArray};
 use super::pictures::Pictures;
+use super::scene::list;
 use super::{
     Axes, Expected, Format, FormatError, FrameReader, Limits, Packing, Part, StackInfo, hdf5, npy,
     npz, png, tar, tiff, zip,
@@ -25,7 +26,7 @@ const ACCEPTED: &str =
 pub struct Wanted<'a> {
     /// The role of the array in the scene.
     pub array: SceneArray,
-    /// Name of the array in the file; `None` for [`SceneArray::name`].
+    /// Name of the array in the file; `None` for [`SceneArray::name`], or for the only array.
     pub name: Option<&'a str>,
     /// Prior knowledge about its shape.
     pub expected: Expected,
@@ -100,11 +101,12 @@ fn open_any(
         return open_zip(file, length, wanted, limits);
     }
     let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
-    if let (Format::Mat | Format::Hdf5, Some(Wanted { array, name, .. })) = (format, wanted) {
-        let wanted = (array, name.unwrap_or(array.name()), &expected);
+    if matches!(format, Format::Mat | Format::Hdf5) {
+        let (array, name) = choose(path, (format, length), wanted)?;
+        let chosen = (array, name.as_str(), &expected);
         return match format {
-            Format::Mat => mat::open(file, length, wanted, limits),
-            _ => hdf5::open(file, wanted, limits),
+            Format::Mat => mat::open(file, length, chosen, limits),
+            _ => hdf5::open(file, chosen, limits),
         };
     }
     if wanted.is_some_and(|wanted| wanted.name.is_some()) {
@@ -120,14 +122,19 @@ fn open_any(
             let members = (format, tar::members(&file, length)?);
             Box::new(Pictures::open(Arc::new(file), members, limits)?)
         }
-        Format::Mat | Format::Hdf5 => return Err(several_arrays(format)),
         Format::Exr => {
             let found = "it is an EXR file (to convert channel Y of each part: python -c \"import numpy, OpenEXR; f = \
                          OpenEXR.File('in.exr', separate_channels=True); numpy.save('out.npy', \
                          [part.channels['Y'].pixels for part in f.parts])\")";
             return Err(FormatError::UnknownFormat { found: found.to_owned(), accepted: ACCEPTED });
         }
-        Format::Npy | Format::Zip | Format::Npz | Format::Planar | Format::Raw => {
+        Format::Npy
+        | Format::Zip
+        | Format::Npz
+        | Format::Mat
+        | Format::Hdf5
+        | Format::Planar
+        | Format::Raw => {
             return Err(FormatError::UnknownFormat {
                 found: format!("it is a {format} file"),
                 accepted: ACCEPTED,
@@ -135,6 +142,38 @@ fn open_any(
         }
     };
     check_picture_axes(reader, &expected)
+}
+
+/// The role and the name of the array to read from a .mat or HDF5 file: the stated name, else the usual one of its role,
+/// else that of the only array.
+fn choose(
+    path: &Path,
+    (format, length): (Format, u64),
+    wanted: Option<Wanted<'_>>,
+) -> Result<(SceneArray, String)> {
+    if let Some(Wanted { array, name: Some(name), .. }) = wanted {
+        return Ok((array, name.to_owned()));
+    }
+    let file = File::open(path).map_err(FormatError::io("open the file"))?;
+    let mut names = match format {
+        Format::Mat => mat::names(file, length)?,
+        _ => hdf5::names(file)?,
+    };
+    match wanted {
+        Some(Wanted { array, .. }) => {
+            // A file of masks is not taken for a measurement.
+            let roles = [SceneArray::Masks, SceneArray::Measurements, SceneArray::Truth];
+            let only = names.len() == 1 && roles.iter().all(|role| role.name() != names[0]);
+            Ok((array, if only { names.remove(0) } else { array.name().to_owned() }))
+        }
+        None if names.len() == 1 => {
+            // The usual names imply scales, which an array without a role does not have.
+            let is_truth = names[0] == SceneArray::Truth.name();
+            let role = if is_truth { SceneArray::Masks } else { SceneArray::Truth };
+            Ok((role, names.remove(0)))
+        }
+        None => Err(several_arrays(format, &names)),
+    }
 }
 
 /// Opens a ZIP of arrays or of pictures.
@@ -154,7 +193,10 @@ fn open_zip(
             let only = (SceneArray::Truth, None, &Expected::default());
             npz::open(Arc::new(file), members, only, limits)
         }
-        None if arrays > 1 => Err(several_arrays(Format::Npz)),
+        None if arrays > 1 => {
+            let names: Vec<String> = members.into_iter().map(|member| member.name).collect();
+            Err(several_arrays(Format::Npz, &names))
+        }
         Some(Wanted { name: Some(_), .. }) => Err(FormatError::NoNames),
         _ => {
             let pictures = Pictures::open(Arc::new(file), (Format::Zip, members), limits)?;
@@ -175,11 +217,11 @@ fn check_picture_axes(
     }
 }
 
-fn several_arrays(format: Format) -> FormatError {
+fn several_arrays(format: Format, names: &[String]) -> FormatError {
     FormatError::Unsupported {
         format,
-        found: "a scene of several arrays".to_owned(),
-        accepted: "one array per file; pass a file of several arrays as a scene",
+        found: list(names),
+        accepted: "a single array, since this role has no `array`: save the array alone",
     }
 }
 

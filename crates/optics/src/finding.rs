@@ -73,8 +73,10 @@ pub enum FindingCode {
     Mosaic,
     ShiftedMasks,
     DriftedMasks,
+    MovedMasks,
     TurnedMasks,
     ForeignMasks,
+    InvertedMasks,
     FastMotion,
     UnfamiliarMasks,
     UnevenError,
@@ -277,14 +279,14 @@ impl FindingCode {
                 Warning,
                 Warning,
                 "12-bit values are left-aligned in 16 bits",
-                "state 65520 as `full_scale` and as `saturation`",
+                "state 65520 as `saturation`; the `full_scale` is the number that one frame adds, at most 65520",
             ),
             Self::RightAligned => (
                 &[Measurement],
                 Warning,
                 Warning,
                 "12-bit values are right-aligned in 16 bits",
-                "if the camera has 12 bits, state 4095 as `full_scale` and as `saturation`",
+                "if the camera has 12 bits, state 4095 as `saturation`; the `full_scale` is the number that one frame adds, at most 4095",
             ),
             Self::Level => (
                 &[Measurement, Result],
@@ -336,14 +338,22 @@ impl FindingCode {
                 Error,
                 "the masks fit better when shifted (by up to 32 pixels)",
                 "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
-                 calibration: calibrate again",
+                 calibration: calibrate again (a job with `registration` auto corrects up to 4 pixels)",
             ),
             Self::DriftedMasks => (
                 &[Measurement],
                 Warning,
                 Warning,
                 "the masks are displaced by a fraction of a pixel",
-                "calibrate again once the optics are stable; if the finding stays, record dark frames and name them as `dark`",
+                "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
+                 finding stays, record dark frames and name them as `dark`",
+            ),
+            Self::MovedMasks => (
+                &[Job],
+                Warning,
+                Warning,
+                "the masks have moved since the calibration; the job has corrected them",
+                "calibrate again once the optics are stable",
             ),
             Self::TurnedMasks => (
                 &[Measurement],
@@ -359,6 +369,13 @@ impl FindingCode {
                 Error,
                 "the masks do not explain the measurement",
                 "name the calibration that belongs to this measurement, or calibrate again",
+            ),
+            Self::InvertedMasks => (
+                &[Measurement],
+                Error,
+                Error,
+                "the masks are inverted: open pixels are 0, closed ones 1",
+                "send 1 - C as the masks, and make the calibration again",
             ),
             Self::FastMotion => (
                 &[Result],

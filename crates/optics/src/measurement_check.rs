@@ -43,6 +43,8 @@ const NEGATIVE_SHARE: f64 = 0.05;
 const PLAUSIBLE_BRIGHTNESS: RangeInclusive<f64> = 0.12..=1.1;
 /// The brightest parts are the blocks from this quantile on.
 const BRIGHTEST: f64 = 0.99;
+/// Inverted masks explain at least this share of the fine structure.
+const MIN_INVERTED: f64 = 0.05;
 /// A snapshot is a copy of a mask if it has no light of other masks, and if that mask explains this share.
 const COPY: f64 = 0.95;
 /// A snapshot is flat if its pixels differ from the mean of their block by less than this share of the mean of the
@@ -636,7 +638,9 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
         findings.push(Finding::new(FindingCode::Negative, detail).escalate_if(negative > 0.1));
     }
     // Without a correct fit the other figures are meaningless, so the checks end at the first of these.
-    let wrong = copy_of_a_mask(figures).or_else(|| shifted_masks(figures));
+    let wrong = copy_of_a_mask(figures)
+        .or_else(|| inverted_masks(figures))
+        .or_else(|| shifted_masks(figures));
     if let Some(finding) = wrong.or_else(|| foreign_masks(figures)) {
         findings.push(finding);
         // Without a fit, all light counts as light of the scene.
@@ -719,7 +723,10 @@ fn drifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
     let asymmetry = rows.asymmetry.hypot(columns.asymmetry);
     let significant = asymmetry > MIN_DRIFT || rows.excess.max(columns.excess) > MIN_DRIFT_EXCESS;
     significant.then(|| {
-        let along_rows = rows.excess > columns.excess;
+        let sign = |drift: Drift| {
+            (drift.asymmetry / MIN_DRIFT).max(drift.excess / MIN_DRIFT_EXCESS)
+        };
+        let along_rows = sign(rows) > sign(columns);
         let (axis, drift) = if along_rows { ("row", rows) } else { ("column", columns) };
         let [before, after] = drift.explained.map(|share| 100.0 * share);
         let detail = format!(
@@ -729,6 +736,20 @@ fn drifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
             100.0 * figures.explained_unshifted
         );
         Finding::new(FindingCode::DriftedMasks, detail)
+    })
+}
+
+/// Masks behind which nearly all frames have negative light: those of the measurement are 1 - C.
+fn inverted_masks(figures: &MeasurementFigures) -> Option<Finding> {
+    let frames = figures.brightness.len();
+    let signs = figures.brightness.iter().zip(&figures.uncertainty);
+    let negative = signs.filter(|(value, error)| **value < -3.0 * **error).count();
+    let inverted = figures.explained_unshifted > MIN_INVERTED && 4 * negative > 3 * frames;
+    inverted.then(|| {
+        let detail = format!(
+            "{negative} of {frames} frames would have negative light: the measurement was recorded with the masks 1 - C"
+        );
+        Finding::new(FindingCode::InvertedMasks, detail)
     })
 }
 
@@ -966,6 +987,8 @@ mod tests {
             assert_eq!(codes(&masks, &y_without_frame), ["missing_pattern"], "seed {seed}");
             let (other, _) = random_squares(10, 140, 140, seed + 100).unwrap();
             assert_eq!(codes(&other, &y), ["foreign_masks"], "seed {seed}");
+            let inverted = masks.mapv(|mask| 1.0 - mask);
+            assert_eq!(codes(&inverted, &y), ["inverted_masks"], "seed {seed}");
             assert_eq!(codes(&masks, &(&y * 4.0)), ["level"], "seed {seed}");
             // Halfway between two pixels, the masks of two displacements fit equally well.
             let half = (&masks.slice(s![.., .., 1..]) + &masks.slice(s![.., .., ..139])) * 0.5;

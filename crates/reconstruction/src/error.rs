@@ -42,6 +42,9 @@ pub enum ReconError {
     /// ONNX Runtime is missing, refused the device, or failed.
     #[error("{0}")]
     Runtime(String),
+    /// The driver of the device stopped or was reset. Only a new process can use the device again.
+    #[error("{0}")]
+    DeviceLost(String),
     /// The frames are no longer finite.
     #[error("the reconstruction diverged at iteration {iteration} of {planned}")]
     Diverged {

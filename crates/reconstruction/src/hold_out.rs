@@ -84,6 +84,14 @@ impl HoldOut {
         y: ArrayView3<'_, f32>,
         v: ArrayView3<'_, f32>,
     ) -> Prediction {
+        Prediction {
+            by_frames: self.residuals(op, y, v).iter().sum(),
+            by_neighbours: self.neighbour_error(y),
+        }
+    }
+
+    /// `||y - m||^2`, where `m` is the mean of the other pixels around each.
+    pub(super) fn neighbour_error(&self, y: ArrayView3<'_, f32>) -> f64 {
         let mut is_held_out = Array3::from_elem(y.dim(), false);
         self.pixels.iter().for_each(|&pixel| is_held_out[pixel] = true);
         let (_, height, width) = y.dim();
@@ -94,17 +102,14 @@ impl HoldOut {
             let window = s![snapshot, around(row, height), around(column, width)];
             let (mut sum, mut count) = (0.0, 0.0);
             for (value, hidden) in y.slice(window).iter().zip(is_held_out.slice(window)) {
-                if !hidden {
+                if !hidden && !value.is_nan() {
                     sum += f64::from(*value);
                     count += 1.0;
                 }
             }
             (f64::from(y[[snapshot, row, column]]) - sum / f64::max(count, 1.0)).powi(2)
         };
-        Prediction {
-            by_frames: self.residuals(op, y, v).iter().sum(),
-            by_neighbours: self.pixels.iter().map(square).sum(),
-        }
+        self.pixels.iter().map(square).sum()
     }
 }
 

@@ -31,6 +31,7 @@ pub mod progress;
 pub mod projection;
 #[cfg(test)]
 mod reference;
+pub mod registration;
 pub mod scale;
 pub mod schedule;
 pub mod sequence;

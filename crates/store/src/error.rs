@@ -106,8 +106,9 @@ pub enum StoreError {
     Quota { whose: &'static str, kept: u64, needed: u64, limit: u64 },
     #[error("{0} uploads of this lab are not complete; end some before another is begun")]
     ManyPartials(u64),
-    #[error("{0} files of this lab wait to be checked; try again when some are done")]
-    ManyChecks(u64),
+    /// A lab has enough checks that wait or run. `mean_seconds` is the mean time of those that have ended.
+    #[error("{checks} files of this lab wait to be checked; try again when some are done")]
+    ManyChecks { checks: u64, mean_seconds: Option<f64> },
     /// The disk has no room for something that is about to be written.
     #[error(
         "{what} needs {needed} bytes; {free} are free, of which {promised} are promised to others and {reserve} \

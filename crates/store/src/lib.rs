@@ -65,12 +65,12 @@ pub use rows::{Expired, Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Asked, Blob, BlobRow, Calibration, Change, Changes, Entitlement, FIRST_RESERVE, FailedTask,
-    FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures, LabRow, LabUse,
-    Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel, NewPartial, Origin,
-    Partial, PartialFile, Request, RequestKey, Reservations, TaskCounts, TaskRecord, TaskTotals,
-    TileHistory, TileResult, TileState, Token, WorkerPlace, WorkerRow, WorkerTakes, WorkerTask,
-    share_error,
+    Asked, Blob, BlobRow, Calibration, Change, Changes, Delivery, Entitlement, FIRST_RESERVE,
+    FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures,
+    LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel, NewPartial,
+    Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations, TaskCounts,
+    TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, WorkerPlace, WorkerRow,
+    WorkerTakes, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

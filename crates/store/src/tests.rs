@@ -82,6 +82,7 @@ impl Lab {
             clipped_negatives: 0,
             mosaic: None,
             reading: None,
+            dispersion: None,
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();
@@ -178,8 +179,11 @@ impl Lab {
             model: None,
             schedule: None,
             tile: Some(TileSpec { size: 64, overlap: 8 }),
+            registration: engine::job::RegistrationRequest::Off,
             priority,
+            truth: None,
             label: None,
+            webhook: None,
         };
         let sequence = measurement.sequence;
         let spec = job.resolve(measurement.calibration, shape, sequence, None).unwrap();

@@ -10,7 +10,9 @@ use ndarray::Array2;
 use super::model_check;
 use super::model_process::ModelCommand;
 use super::transport::{Check, TaskError};
-use engine::intake::{self, Behind, Exposure, IntakeError, Refusal, RefusalCode, Source, plan};
+use engine::intake::{
+    self, Behind, Exposure, IntakeError, Refusal, RefusalCode, Source, expected_size, plan,
+};
 use engine::job::{
     CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Sequence, Sha256,
     Submission, TaskStage, keeps_mosaic,
@@ -177,7 +179,16 @@ impl Running<'_> {
     /// Checks masks and writes them on \[0,1\].
     fn masks(&self, request: &CalibrationRequest) -> Result<Checked> {
         let CalibrationRequest {
-            name, array, axes, crop, frames, packing, full_scale, mosaic, ..
+            name,
+            array,
+            axes,
+            crop,
+            frames,
+            packing,
+            full_scale,
+            mosaic,
+            dispersion,
+            ..
         } = request.clone();
         let wrong = || Refusal::new(RefusalCode::InvalidRequest, "name the masks").at("/masks");
         let masks = request.masks.ok_or_else(wrong)?;
@@ -185,7 +196,8 @@ impl Running<'_> {
         let source = Source::upload(&file, SceneArray::Masks, full_scale, self.limits())
             .named(array.map(|name| name.to_string()))
             .arranged(axes, None)
-            .part(Part { crop, frames }, packing);
+            .part(Part { crop, frames }, packing)
+            .dispersed(dispersion.clone());
         let opened = source.open()?;
         let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         let mut writer = self.writer(&info)?;
@@ -212,6 +224,7 @@ impl Running<'_> {
             clipped_negatives: statistics.clipped_negative,
             mosaic,
             reading: Some(reading),
+            dispersion,
         };
         Ok(Checked::Masks(facts, writer.finish()?.finish()?))
     }
@@ -234,6 +247,10 @@ impl Running<'_> {
             let detail = "the window of a mosaic starts at an even row and an even column";
             return Err(Refusal::new(RefusalCode::InvalidRequest, detail).at("/crop").into());
         }
+        if masks.dispersion.is_some() && request.sequence == Some(Sequence::Contiguous) {
+            let detail = "the bands of two spectral snapshots do not continue one another: leave the sequence out";
+            return Err(Refusal::new(RefusalCode::InvalidRequest, detail).at("/sequence").into());
+        }
         let source = Source::upload(&file, SceneArray::Measurements, request.full_scale, limits)
             .named(request.array.map(|name| name.to_string()))
             .arranged(request.axes, Some((masks.height, masks.width)))
@@ -241,9 +258,14 @@ impl Running<'_> {
         let opened = source.open()?;
         let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         if (info.height, info.width) != (masks.height, masks.width) {
+            let remedy = match &masks.dispersion {
+                Some(dispersion) => expected_size(dispersion, (masks.height, masks.width)),
+                None => "state the window that both have in common as `crop`, with the calibration if the masks are \
+                         larger"
+                    .to_owned(),
+            };
             let detail = format!(
-                "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}: state the window \
-                 that both have in common as `crop`, with the calibration if the masks are larger",
+                "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}: {remedy}",
                 info.height, info.width, calibration.id, masks.height, masks.width
             );
             return Err(Refusal::new(RefusalCode::SizeMismatch, detail).at("/data").into());
@@ -262,9 +284,14 @@ impl Running<'_> {
         let prepared = self.check.store.dir().blob(&calibration.prepared);
         let arrays = (prepared.as_path(), staged.path());
         let has_dark = !exposure.dark.is_empty();
-        let judged = intake::judge(arrays, masks.mosaic, has_dark, &limits)?;
+        let judged =
+            intake::judge(arrays, (masks.mosaic, masks.dispersion.as_ref()), has_dark, &limits)?;
         let warnings = intake::combined(passed.findings, judged);
-        let estimated = Sequence::from_camera(request.camera_fps, request.exposure_s, masks.frames);
+        let estimated = match masks.dispersion {
+            // The last band of a snapshot and the first of the next one do not resemble one another.
+            Some(_) => Sequence::Separate,
+            None => Sequence::from_camera(request.camera_fps, request.exposure_s, masks.frames),
+        };
         let facts = NewMeasurement {
             name: request.name,
             calibration: request.calibration,

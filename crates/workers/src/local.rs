@@ -13,7 +13,7 @@ use tokio::sync::Mutex;
 use super::transport::{
     Check, Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
 };
-use engine::job::{Sha256, TaskKind, TaskProgress, WorkerId};
+use engine::job::{Registered, Sha256, TaskKind, TaskProgress, WorkerId};
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::blend::StoredTile;
@@ -35,18 +35,26 @@ pub struct Local {
     store: Store,
     worker: WorkerId,
     claimant: Claimant<'static>,
+    /// Device of its networks, for the list of workers.
+    device: String,
     /// Opened at the first use.
     watcher: Arc<Mutex<Option<Watcher>>>,
 }
 
 impl Local {
-    /// A transport for the worker `worker`, which takes the tasks that `claimant` may claim.
-    pub fn new(store: Store, worker: WorkerId, claimant: Claimant<'static>) -> Self {
-        Self { store, worker, claimant, watcher: Arc::default() }
+    /// A transport for the worker `worker` with networks on `device`, which takes the tasks that `claimant` may claim.
+    pub fn new(
+        store: Store,
+        worker: WorkerId,
+        claimant: Claimant<'static>,
+        device: String,
+    ) -> Self {
+        Self { store, worker, claimant, device, watcher: Arc::default() }
     }
 
-    fn arrays(&self, masks: Sha256, snapshots: Sha256) -> Arrays {
-        Arrays { masks: (self.path(masks), masks), snapshots: (self.path(snapshots), snapshots) }
+    fn arrays(&self, masks: Sha256, snapshots: Sha256, shift: Option<[f64; 2]>) -> Arrays {
+        let [masks, snapshots] = [masks, snapshots].map(|sha256| (self.path(sha256), sha256));
+        Arrays { masks, snapshots, shift }
     }
 
     /// Collects everything that a task needs.
@@ -68,7 +76,7 @@ impl Local {
                 }),
                 None => {
                     let masks = task.masks.ok_or_else(|| missing_input(kind))?;
-                    Ok(TaskInput::Report(self.path(masks)))
+                    Ok(TaskInput::Report { masks: self.path(masks), spectral: task.spectral })
                 }
             },
             Work::Movie(work) => {
@@ -80,10 +88,17 @@ impl Local {
 
     fn step(&self, task: &JobTask, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
         let JobTask { job, spec, calibration, measurement, .. } = task;
-        let arrays = self.arrays(calibration.prepared, measurement.prepared);
+        let shift = shift(task.prepared.as_ref())?;
+        let arrays = self.arrays(calibration.prepared, measurement.prepared, shift);
         let folder = || self.store.staged_dir().map_err(failed);
         Ok(match kind {
-            TaskKind::Prepare => TaskInput::Prepare { arrays, snapshots: spec.snapshots },
+            TaskKind::Prepare => TaskInput::Prepare {
+                // The calibrated masks are registered, also in a second attempt.
+                arrays: Arrays { shift: None, ..arrays },
+                snapshots: spec.snapshots,
+                registration: spec.registration,
+                is_coloured: spec.shape.mosaic.is_some() || spec.dispersion.is_some(),
+            },
             TaskKind::Preview { snapshot } => TaskInput::Preview {
                 arrays,
                 shape: spec.shape,
@@ -167,7 +182,8 @@ impl Local {
 
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
-        let (location, takes) = (WorkerPlace::default(), self.claimant.takes());
+        let location = WorkerPlace { device: Some(self.device.clone()), ..WorkerPlace::default() };
+        let takes = self.claimant.takes();
         Ok(self.store.worker_started(self.worker, std::process::id(), &location, takes).await?)
     }
 
@@ -249,7 +265,7 @@ impl Transport for Local {
     }
 
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError> {
-        let arrays = self.arrays(task.masks, task.measurement);
+        let arrays = self.arrays(task.masks, task.measurement, task.shift);
         let input = arrays.window(task.snapshots.clone(), &task.tile.window(), task.white)?;
         Ok(TileInput { pieces: task.pieces.clone(), ..input })
     }
@@ -271,6 +287,17 @@ fn missing_input(kind: TaskKind) -> PipelineError {
 /// Reads a record that this program wrote.
 fn parsed<T: DeserializeOwned>(what: &'static str, record: &Value) -> Result<T, PipelineError> {
     T::deserialize(record).map_err(PipelineError::record(what))
+}
+
+/// The registration of the masks, as the prepare task recorded it. It is `None` before that task.
+fn registered(prepared: Option<&Value>) -> Result<Option<Registered>, PipelineError> {
+    let Some(prepared) = prepared else { return Ok(None) };
+    Ok(parsed::<Option<PreparedRecord>>("prepare task", prepared)?.and_then(|it| it.registration))
+}
+
+/// The shift of the masks, if they are corrected.
+fn shift(prepared: Option<&Value>) -> Result<Option<[f64; 2]>, PipelineError> {
+    Ok(registered(prepared)?.and_then(|registered| registered.applied_shift()))
 }
 
 /// The solver's scale, as the prepare task recorded it.
@@ -295,10 +322,12 @@ fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
     let facts = &measurement.facts;
     let frames = spec.shape.frames;
     let record = CameraRecord::new((facts.camera_fps, facts.exposure_s), 0, frames);
+    // The bands of a spectral camera are exposed at the same time.
+    let record = record.filter(|_| spec.dispersion.is_none());
     let exposure = record.and_then(|record| record.frame_exposure_s(frames));
     Ok(MovieTask {
         format: *format,
-        shape: spec.shape,
+        shape: spec.frame_shape(),
         window,
         requested: work.window.is_some(),
         scene_fps: exposure.map(|seconds| 1.0 / seconds),
@@ -332,6 +361,7 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
         pieces.into_iter().filter(|piece| piece.run == run).map(|piece| piece.snapshots);
     Ok(TileTask {
         masks: task.calibration.prepared,
+        shift: shift(task.prepared.as_ref())?,
         measurement: task.measurement.prepared,
         snapshots: first..first + runs.runs()[run].len() as u32,
         pieces: run_pieces.map(|piece| piece.start - start..piece.end - start).collect(),
@@ -353,7 +383,9 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
         algorithm: spec.algorithm,
         schedule: full_schedule(&spec.schedule, pilot.as_ref()),
         pilot,
+        registration: registered(task.prepared.as_ref())?,
         shape: spec.shape,
+        dispersion: spec.dispersion.clone(),
         inputs: Inputs {
             masks_sha256: calibration.masks,
             masks_axes: calibration.axes.clone(),

@@ -47,6 +47,8 @@ pub struct ModelCommand {
     pub check: Vec<OsString>,
     /// Memory limit of the process in bytes.
     pub memory_bytes: Option<u64>,
+    /// The execution provider of the network, for records.
+    pub provider: &'static str,
 }
 
 /// The process of the network that was used last.
@@ -346,7 +348,13 @@ mod tests {
         std::fs::write(&path, "8 bytes.").unwrap();
         let run = ["-c".into(), format!("head -c 16 >/dev/null; {script}").into()].into();
         let (check, memory_bytes) = (Vec::new(), Some(512 << 20));
-        let command = ModelCommand { program: "sh".into(), run, check, memory_bytes };
+        let command = ModelCommand {
+            program: "sh".into(),
+            run,
+            check,
+            memory_bytes,
+            provider: "CPUExecutionProvider",
+        };
         let mut processes = ModelProcesses::new(command);
         let file = ModelFile::open(&path).unwrap();
         let process = processes.only(Some(&file), monitor)?.unwrap();

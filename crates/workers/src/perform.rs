@@ -27,7 +27,7 @@ use engine::pipeline::scale::Histogram;
 use engine::pipeline::tile::{reconstruct_tile, run_network};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{write_manifest, write_result};
-use engine::pipeline::{movie, preview, scale};
+use engine::pipeline::{movie, preview, registration, scale};
 use formats::planar::{self, Reader};
 use formats::{Limits, StackInfo};
 use reconstruction::sequence::RunShare;
@@ -49,11 +49,14 @@ pub(super) fn perform(
     monitor: &Monitor,
 ) -> Result<Done, TaskError> {
     let (record, output) = match input {
-        TaskInput::Prepare { arrays, snapshots } => {
+        TaskInput::Prepare { arrays, snapshots, registration, is_coloured } => {
             arrays.verify()?;
             let white = scale::job_white_level(&arrays, snapshots, monitor)?;
+            let job = (&arrays, snapshots);
+            let registration =
+                registration::register_stored(job, (registration, is_coloured), white, monitor)?;
             monitor.reach(TaskStage::Reading, 1.0);
-            (json(&PreparedRecord { white })?, Output::Record)
+            (json(&PreparedRecord { white, registration })?, Output::Record)
         }
         TaskInput::Preview { arrays, shape, snapshot, white } => {
             let frames = preview::frames(&arrays, shape, snapshot, white, monitor)?;
@@ -139,9 +142,9 @@ pub(super) fn perform(
             movie::write(file.path(), &task, monitor)?;
             (json(&task.requested.then_some(task.window))?, Output::File(file))
         }
-        TaskInput::Report(masks) => {
+        TaskInput::Report { masks, spectral } => {
             let masks = Reader::open(&masks, &Limits::default()).map_err(IntakeError::from)?;
-            let report = intake::report(&masks, &mut |share| proceed(share, monitor))?;
+            let report = intake::report(&masks, spectral, &mut |share| proceed(share, monitor))?;
             (Value::Null, calibration(None, report, monitor))
         }
     };
@@ -181,6 +184,7 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
         clipped_negatives: calibrated.clipped_negatives,
         mosaic: None,
         reading: None,
+        dispersion: None,
     }
 }
 
@@ -224,7 +228,8 @@ fn white_level(
         let shares = shares.collect::<Result<Vec<_>, _>>()?;
         for k in 0..recipe.shape.frames {
             monitor.check()?;
-            histogram.add(&blend::stored_frame(&recipe.tile_plan, &shares, k)?);
+            let frame = blend::stored_frame(&recipe.tile_plan, &shares, k)?;
+            histogram.add(&recipe.frame(k, frame));
         }
         monitor.reach(TaskStage::Reading, (index + 1) as f64 / f64::from(snapshots.count));
     }
@@ -254,6 +259,7 @@ fn tile(
     monitor: &Monitor,
 ) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
     let Engines { networks, models } = engines;
+    let model_provider = models.command().provider;
     let before_fetch = cpu_seconds();
     // Fetches all files of the task, including the network's.
     let input = transport.window(task)?;
@@ -280,7 +286,10 @@ fn tile(
     let source = networks.source();
     let (process_seconds, process_peak) = process.map_or((0.0, 0), |process| process.bill());
     let cost = CostRecord {
-        provider: uses_network.then(|| source.provider().into()),
+        provider: uses_network.then(|| match task.model {
+            Some(_) => model_provider.into(),
+            None => source.provider().into(),
+        }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
         cpu_seconds: cpu_seconds() - before + process_seconds,
         peak_rss_bytes: peak_rss_bytes() + process_peak,

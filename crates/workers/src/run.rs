@@ -50,6 +50,9 @@ pub enum WorkerError {
     /// A task hangs, probably in native code. Only the end of the process can end it.
     #[error("the task made no progress for {} seconds", .0.as_secs())]
     Stalled(Duration),
+    /// The server of this worker counts the task as lost, and another process tries it.
+    #[error("{0}")]
+    DeviceLost(String),
     #[error("the task was given back in the middle of an iteration")]
     Unfinished,
 }
@@ -93,7 +96,7 @@ impl<T: Transport> Worker<T> {
 
     /// Works until `stop` is cancelled.
     /// Errors: see [`WorkerError`]. The worker survives a failed task and a temporary failure of the database.
-    /// After [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still runs, so the
+    /// After [`WorkerError::DeviceLost`], [`WorkerError::Stalled`] and [`WorkerError::Unfinished`] the computing thread still runs, so the
     /// process must end.
     pub async fn run(mut self) -> Result<(), WorkerError> {
         self.transport.started().await?;
@@ -138,6 +141,9 @@ impl<T: Transport> Worker<T> {
         let computing = self.start(input, &monitor, span.clone());
         let watched = async {
             match self.watch(computing, &lease, &monitor, patience).await {
+                Ok(((_, Err(error)), _)) if error.is_device_loss() => {
+                    Err(WorkerError::DeviceLost(error.to_string()))
+                }
                 Ok(((engines, outcome), reason)) => {
                     self.engines = Some(engines);
                     self.end(&lease, outcome, reason, &monitor).await;
@@ -160,7 +166,7 @@ impl<T: Transport> Worker<T> {
             }
             WorkerError::Unfinished => log_failure(self.transport.give_back(lease).await),
             // The supervisor reports the exit status of this process.
-            WorkerError::Panicked | WorkerError::Transport(_) => {}
+            WorkerError::Panicked | WorkerError::Transport(_) | WorkerError::DeviceLost(_) => {}
         }
     }
 

@@ -13,7 +13,8 @@ use tokio::runtime::Handle;
 
 use engine::intake::{CaptureFiles, IntakeError};
 use engine::job::{
-    JobId, JobSpec, Mosaic, ResultFile, SceneShape, Schedule, Sha256, SnapshotRange, TaskProgress,
+    JobId, JobSpec, Mosaic, RegistrationRequest, ResultFile, SceneShape, Schedule, Sha256,
+    SnapshotRange, TaskProgress,
 };
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
@@ -23,6 +24,7 @@ use engine::pipeline::movie::MovieTask;
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::tile::TileInput;
 use formats::{DiskTrouble, FormatError};
+use reconstruction::ReconError;
 use reconstruction::assessment::Evidence;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
@@ -106,10 +108,12 @@ pub struct Claim {
 /// The work of a task, with its complete input.
 #[derive(Debug)]
 pub enum TaskInput {
-    /// Estimate the solver's scale of a job.
+    /// Estimate the solver's scale of a job, and register its masks.
     Prepare {
         arrays: Arrays,
         snapshots: SnapshotRange,
+        registration: RegistrationRequest,
+        is_coloured: bool,
     },
     Preview {
         arrays: Arrays,
@@ -159,7 +163,11 @@ pub enum TaskInput {
         masks: Box<BlobWriter>,
     },
     /// Make a report on the masks in this prepared array.
-    Report(PathBuf),
+    Report {
+        masks: PathBuf,
+        /// True for the bands of one mask.
+        spectral: bool,
+    },
     /// Write a movie to the file.
     Movie(Box<MovieTask>, StagedPath),
 }
@@ -178,6 +186,9 @@ pub struct Check {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTask {
     pub masks: Sha256,
+    /// Pixels by which the masks have moved down and to the right.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shift: Option<[f64; 2]>,
     pub measurement: Sha256,
     /// The run of snapshots that the tile belongs to, as indices in the measurement.
     pub snapshots: Range<u32>,
@@ -241,6 +252,11 @@ impl TaskError {
                 store.or_else(|| format.and_then(FormatError::disk_trouble))
             }
         }
+    }
+
+    /// True if the process must be replaced, because it can't use its device again.
+    pub(super) fn is_device_loss(&self) -> bool {
+        matches!(self, Self::Pipeline(PipelineError::Recon(ReconError::DeviceLost(_))))
     }
 
     pub(super) fn is_retryable(&self) -> bool {

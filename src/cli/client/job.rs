@@ -47,7 +47,7 @@ pub(in crate::cli) enum Wanted {
     /// The multi-part EXR with the expected error in an additional layer `sigma`.
     #[value(name = "stack-sigma.exr")]
     StackWithError,
-    /// The frames of each snapshot as a BigTIFF for Fiji and napari.
+    /// The frames of each snapshot as an OME-TIFF for ImageJ, Fiji and napari.
     #[value(name = "stack.tif")]
     Tiff,
     /// A movie of each snapshot.
@@ -74,7 +74,7 @@ pub(in crate::cli) enum Wanted {
     /// The frames of all snapshots, one after the other.
     #[value(name = "sequence.npy")]
     SequenceArray,
-    /// The frames of all snapshots as a BigTIFF.
+    /// The frames of all snapshots as an OME-TIFF.
     #[value(name = "sequence.tif")]
     SequenceTiff,
     /// A movie of all snapshots.

@@ -5,6 +5,7 @@ mod job;
 mod unreachable;
 mod upload;
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -15,6 +16,7 @@ use reqwest::{RequestBuilder, Response, StatusCode};
 use serde_json::Value;
 
 use super::CliError;
+use super::fields::{Role, as_options};
 
 pub(super) use download::rename_new;
 pub(super) use job::{Job, Wanted};
@@ -60,6 +62,19 @@ pub(super) enum ClientError {
 }
 
 pub(super) type Result<T, E = ClientError> = std::result::Result<T, E>;
+
+impl ClientError {
+    /// A refusal of a file, with the options of the command line in place of the fields of the API.
+    pub(super) fn about(self, role: Role, file: &Path) -> Self {
+        match self {
+            Self::Refused { status, code, detail } => {
+                let detail = format!("{}: {}", file.display(), as_options(&detail, role));
+                Self::Refused { status, code, detail }
+            }
+            other => other,
+        }
+    }
+}
 
 impl From<ClientError> for CliError {
     fn from(error: ClientError) -> Self {

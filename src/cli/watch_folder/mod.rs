@@ -24,11 +24,12 @@ use uuid::Uuid;
 use super::CliError;
 use super::client::{Client, ClientError, Job, ServiceArguments, Wanted, rename_new};
 use super::error::Result;
+use super::exec::{End, ExecArguments};
 use super::output::print_line;
 use super::submission::{Recipe, SubmissionArguments};
 use super::verdict;
 use super::wait::wait;
-use engine::job::{Finding, JobState};
+use engine::job::{Assessment, Finding, JobState};
 use ledger::{Entry, Ledger, Shot, Stage};
 
 /// Extensions of files that may hold snapshots. The service detects the format by the content.
@@ -58,6 +59,8 @@ pub struct Arguments {
     #[arg(long = "file", value_name = "NAME", value_delimiter = ',', value_enum,
           default_values = ["frames.npy", "stack.tif", "manifest.json"])]
     files: Vec<Wanted>,
+    #[command(flatten)]
+    exec: ExecArguments,
     /// End when all files are done.
     #[arg(long)]
     once: bool,
@@ -87,14 +90,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             ledger,
             growing: HashMap::new(),
             failed: 0,
-            findings: Vec::new(),
+            results: Vec::new(),
         };
         watch.run().await?;
         if watch.failed > 0 {
             let text = format!("{} files have failed; see their .failed.txt", watch.failed);
             return Err(CliError::Failure(text));
         }
-        verdict::refuse_errors([&*watch.findings])
+        let results = watch.results.iter();
+        verdict::refuse_bad(
+            results.map(|(findings, assessment)| (&**findings, assessment.as_ref())),
+        )
     })
 }
 
@@ -110,8 +116,8 @@ struct Watch<'a> {
     growing: HashMap<Shot, Instant>,
     /// Files that have failed since the start.
     failed: usize,
-    /// Findings of the jobs that have ended since the start.
-    findings: Vec<Finding>,
+    /// Findings and assessments of the jobs that have ended since the start.
+    results: Vec<(Vec<Finding>, Option<Assessment>)>,
 }
 
 impl Watch<'_> {
@@ -214,6 +220,7 @@ impl Watch<'_> {
             self.failed += 1;
             self.write_failure(&entry, reason)?;
         }
+        self.exec(&entry, &stage).await;
         self.record(Entry { stage, ..entry })
     }
 
@@ -236,7 +243,8 @@ impl Watch<'_> {
         }
         self.arguments.submission.send_dark(&self.client).await?;
         let label: String = entry.shot.name.chars().take(200).collect();
-        let job = entry.recipe.submit(&self.client, data, Some(&label), &entry.key).await?;
+        let job =
+            entry.recipe.submit(&self.client, (&path, data), Some(&label), &entry.key).await?;
         Ok(Some(Stage::Submitted { job: Job::new(job)?.id }))
     }
 
@@ -279,7 +287,7 @@ impl Watch<'_> {
             job.algorithm,
             job.created_at,
         );
-        self.findings.extend(findings);
+        self.results.push((findings, job.assessment.clone()));
         fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
         write_new(&folder.join(REPORT), &text)
     }
@@ -306,6 +314,34 @@ impl Watch<'_> {
             print_line(format!("{} {step}", entry.shot.name))?;
         }
         self.ledger.record(entry)
+    }
+
+    /// Runs the command of the user for a file that has ended. The ledger does not name the end yet, so that a kill can't
+    /// leave the command out.
+    async fn exec(&self, entry: &Entry, stage: &Stage) {
+        let job = match &entry.stage {
+            Stage::Submitted { job } => job.clone(),
+            _ => String::new(),
+        };
+        let end = End { job, label: entry.shot.name.clone(), ..End::default() };
+        let (end, results) = match stage {
+            Stage::Taken | Stage::Submitted { .. } => return,
+            Stage::Failed { reason } => {
+                let (state, error) = ("failed".to_owned(), reason.clone());
+                (End { state, error, ..end }, failure_file(&entry.results))
+            }
+            Stage::Done { .. } => {
+                let last = self.results.last();
+                let verdict = last
+                    .map(|(findings, assessment)| verdict::verdict(assessment.as_ref(), findings));
+                let (state, verdict) = ("succeeded".to_owned(), verdict.unwrap_or_default());
+                (End { state, verdict, ..end }, result_folder(&entry.results))
+            }
+        };
+        let (file, results) = (self.folder.join(&entry.shot.name), self.folder.join(results));
+        if let Err(error) = self.arguments.exec.run(&end, Some((&file, &results))).await {
+            eprintln!("sci-recon: {error}");
+        }
     }
 
     /// Prints why the service is unavailable, and waits.

@@ -1,6 +1,7 @@
 // Actions on one or several jobs: cancel, retry, rename, delete (with a confirmation).
 
 import { announce, h, put } from "./dom.js";
+import { menu } from "./menu.js";
 import { nameOf } from "./format.js";
 import { send } from "./api.js";
 
@@ -10,9 +11,12 @@ const ACTIONS = {
   delete: { word: "Delete", states: ["succeeded", "failed", "cancelled"], run: remove },
 };
 
-/** Buttons for the actions that a job's state allows; `done(action, job)` receives the service's answer. */
-export function actions(job, done) {
-  return Object.entries(ACTIONS)
+/**
+ * Buttons for the actions that a job's state allows; `done(action, job)` receives the service's answer. Delete is in a menu,
+ * together with `more` buttons.
+ */
+export function actions(job, done, more = []) {
+  const allowed = Object.entries(ACTIONS)
     .filter(([, action]) => action.states.includes(job.state))
     .map(([name, action]) => {
       const label = `${action.word} ${nameOf(job)}`;
@@ -32,6 +36,9 @@ export function actions(job, done) {
       };
       return h("button", { type: "button", class: `small ${name}`, "aria-label": label, title: label, onclick: press }, action.word);
     });
+  const [hidden, shown] = [true, false].map((inside) => allowed.filter((button) => button.classList.contains("delete") === inside));
+  const items = [...more, ...hidden];
+  return [...shown, ...(items.length ? [menu(`More actions for ${nameOf(job)}`, items)] : [])];
 }
 
 async function remove(job) {

@@ -10,6 +10,8 @@ import { every } from "./live.js";
 import { exact, figure, moment, momentInFull, nameOf } from "./format.js";
 import { get, send } from "./api.js";
 import { grade, report } from "./report.js";
+import { menu } from "./menu.js";
+import { sampled } from "./values.js";
 
 export async function calibrations(root, _, signal) {
   const list = h("ul", { class: "tiling" });
@@ -64,13 +66,13 @@ export async function calibration(root, [id], signal) {
     call(item);
     put(buttons,
       item.state === "ready" && h("a", { class: "button primary", href: `#/new?calibration=${id}` }, "Use for a new job"),
-      h("button", { type: "button", onclick: () => rename(item.name, async (name) => {
+      menu(`More actions for ${nameOf(item)}`, [h("button", { type: "button", class: "small", onclick: () => rename(item.name, async (name) => {
         Object.assign(item, await send("PATCH", `/v1/calibrations/${id}`, { name }));
         call(item);
-      }) }, "Rename"),
-      h("button", { type: "button", class: "delete", onclick: () => erase(item) }, "Delete"));
+      }) }, "Rename"), h("button", { type: "button", class: "small delete", onclick: () => erase(item) }, "Delete")]));
     if (item.state !== "ready") {
-      put(body, h("p", { class: item.state === "failed" ? "trouble" : "note" }, unready(item)));
+      const failed = item.state === "failed";
+      put(body, h("p", { class: failed ? "trouble" : "note" }, unready(item)), failed && h("p", null, h("a", { href: "#/new" }, "Create another calibration")));
       return;
     }
     const masks = new Masks(item, signal);
@@ -108,6 +110,7 @@ function about(item) {
     ["Masks (compression ratio)", item.frames],
     ["Size", `${item.height} × ${item.width} (rows × columns)`],
     ["Sensor", item.mosaic ? `in colour, ${item.mosaic.toUpperCase()}` : "grey"],
+    item.dispersion && ["Dispersion", `one mask for ${item.dispersion.offsets.length} bands, displaced by up to ${figure(Math.max(...item.dispersion.offsets))} pixels along a ${item.dispersion.axis}`],
     ["Mean transmission", figure(item.mask_mean)],
     ["Dead pixels", `${item.dead_pixels} (${figure((100 * item.dead_pixels) / pixels, 2)} %)`],
     ["Values below 0, set to 0", item.clipped_negatives],
@@ -154,6 +157,8 @@ class Masks {
     this.spread = await get(`/view/calibrations/${this.item.id}/pictures/${one ? "mask-1" : this.choice.value}/spread`, this.signal);
     this.contrast.offer(this.spread);
     this.draw();
+    const { base } = this.source(one ? "mask-1" : this.choice.value);
+    sampled({ base, ...this.spread }).then((values) => this.contrast.distribution(values)).catch(() => {});
   }
 
   draw() {

@@ -7,9 +7,9 @@ import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, h, put, say } from "./dom.js";
 import { bytes, duration, expectedRange, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
-import { isAborted, get, upload } from "./api.js";
-import { keepTruth, truthOf } from "./storage.js";
+import { isAborted, get, send, upload } from "./api.js";
 import { networks, ran } from "./provenance.js";
+import { sampled } from "./values.js";
 
 export async function compare(root, [path], signal) {
   const ids = path.split("/");
@@ -19,7 +19,7 @@ export async function compare(root, [path], signal) {
   const manifests = await Promise.all(jobs.map((job) => manifest(job, signal)));
   const all = manifests.every(Boolean);
   if (!same) {
-    root.append(h("p", { class: "trouble" }, `These jobs can't be compared frame by frame: their frames are ${jobs.map(shapeOf).join(" and ")}.`));
+    root.append(h("p", { class: "trouble" }, `These jobs can't be compared frame by frame: their frames are ${jobs.map(shapeOf).join(" and ")}. `, h("a", { href: "#/jobs" }, "Select other jobs")));
   } else if (all) {
     const group = new Group(jobs, signal);
     root.append(group.element);
@@ -32,16 +32,15 @@ export async function compare(root, [path], signal) {
   put(table, figures(jobs, manifests));
 }
 
-/** PSNR and SSIM of all jobs against true frames, attached here or earlier. */
+/** PSNR and SSIM of all jobs against true frames, which are attached to the jobs here or were earlier. */
 function truth(jobs, manifests, table, signal) {
   const input = h("input", { type: "file", id: "truth", class: "unseen" });
   const status = h("span", { class: "muted", "aria-live": "polite" }, "npy, TIFF or .mat, in the scale of the frames");
-  const measure = async ({ sha256, name }) => {
+  const measure = async (truths) => {
     say(status, "Comparing the frames …");
-    const found = await Promise.all(jobs.map((job) => get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/quality?truth=${sha256}`, signal)));
-    jobs.forEach((job) => keepTruth(job.id, { sha256, name }));
+    const found = await Promise.all(jobs.map((job, index) => get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/quality?truth=${truths[index]}`, signal)));
     put(table, figures(jobs, manifests, found));
-    say(status, `Measured against ${name}.`);
+    say(status, "Measured against the true frames of the jobs.");
   };
   const showError = (error) => isAborted(error) || put(status, h("span", { class: "warn" }, error.message));
   input.addEventListener("change", async () => {
@@ -49,17 +48,17 @@ function truth(jobs, manifests, table, signal) {
     if (!file) return;
     try {
       const { sha256 } = await upload(file, (done, total) => say(status, `${bytes(done)} of ${bytes(total)}`), signal);
-      await measure({ sha256, name: file.name });
+      await measure(jobs.map(() => sha256));
+      await Promise.all(jobs.map((job) => send("PATCH", `/v1/jobs/${job.id}`, { truth: sha256 })));
     } catch (error) {
       showError(error);
     }
   });
-  const before = jobs.map((job) => truthOf(job.id));
-  const one = before.find(Boolean);
+  const first = jobs.find((job) => job.truth);
   // True frames of one scene are meaningless for another.
-  const fits = (job, index) => job.measurement === jobs[before.indexOf(one)].measurement || before[index]?.sha256 === one.sha256;
-  if (one && jobs.every(fits)) measure(one).catch(showError);
-  return h("div", { class: "row" }, h("label", { for: "truth", class: "button small filebutton" }, "Attach true frames", input), status);
+  const truths = jobs.map((job) => job.truth ?? (job.measurement === first?.measurement ? first.truth : null));
+  if (truths.every(Boolean)) measure(truths).catch(showError);
+  return h("div", { class: "row" }, h("label", { for: "truth", class: "button small filebutton writes" }, "Attach true frames", input), status);
 }
 
 async function manifest(job, signal) {
@@ -67,6 +66,8 @@ async function manifest(job, signal) {
   return get(`/v1/jobs/${job.id}/snapshots/${job.snapshots.first}/exports/manifest`, signal);
 }
 
+/** Largest ratio of the white levels of jobs that share one contrast. */
+const MAX_RATIO = 1.5;
 const MODES = [["beside", "Side by side"], ["wipe", "Wipe"], ["difference", "Difference"], ["flicker", "Alternate"]];
 
 /** Synchronised panes. The first one can also show a pair of jobs. */
@@ -76,9 +77,11 @@ class Group {
     Object.assign(this, { jobs, signal, turn: 0, mode: "beside" });
     this.view = new View(height, width);
     this.panes = jobs.map((job) => new Pane(nameOf(job), this.view, signal));
-    this.contrast = new Contrast("frames", () => this.show());
+    this.contrasts = jobs.map((job) => new Contrast(nameOf(job), (from) => this.adjust(from), nameOf(job)));
+    this.match = h("input", { type: "checkbox", id: "match", onchange: () => this.rescale() });
+    this.scales = h("span", { class: "muted" });
     this.player = new Player(frames, signal, () => this.show());
-    this.player.ahead = (frame) => this.panes.every((pane, index) => pane.prepare(this.source(index, frame), ...this.contrast.window()));
+    this.player.ahead = (frame) => this.panes.every((pane, index) => pane.prepare(this.source(index, frame), ...this.contrasts[index].window()));
     this.modes = MODES.map(([value, text]) => h("button", { type: "button", id: value, "aria-pressed": String(value === this.mode), onclick: () => this.choose(value) }, text));
     const pick = (id, label, chosen) => {
       const select = h("select", { id, "aria-label": label, onchange: () => this.show() }, jobs.map((job, index) => h("option", { value: index, selected: index === chosen }, nameOf(job))));
@@ -94,7 +97,9 @@ class Group {
     this.element = h("section", { class: "card viewer", "aria-label": "Frames of the jobs" },
       h("div", { class: "row", role: "group", "aria-label": "Mode of comparison" }, this.modes, this.pairing, this.wipe, this.gain, this.rateLabel,
         h("span", { class: "grow" }), h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit")),
-      this.panels, this.player.element, this.contrast.element,
+      this.panels, this.player.element,
+      h("div", { class: "row matching" }, h("label", { for: "match", class: "row" }, this.match, "Match scale"), this.scales),
+      h("div", { class: `panes of${jobs.length} contrasts` }, this.contrasts.map((contrast) => contrast.element)),
       h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. Drag the line of the wipe, or use its slider.")));
     this.player.keys(this.element);
     this.drag();
@@ -125,19 +130,45 @@ class Group {
   }
 
   source(index, frame) {
-    const { levels, tile } = this.spread;
+    const { levels, tile } = this.spreads[index];
     return { base: this.base(index, frame), levels, tile, label: `Frame ${frame} of ${nameOf(this.jobs[index])}` };
   }
 
   async open() {
     const middle = Math.ceil(this.player.count / 2);
     const spreads = await Promise.all(this.jobs.map((_, index) => get(`${this.base(index, middle)}/spread`, this.signal)));
-    // All jobs share one contrast window, so that differences in brightness are visible.
+    this.spreads = spreads;
+    // A job with another scale would be black next to the others, or white.
+    const whites = spreads.map(({ high }) => Math.max(high, 1e-9));
+    const ratio = Math.max(...whites) / Math.min(...whites);
+    this.match.checked = ratio > MAX_RATIO;
+    say(this.scales, ratio > MAX_RATIO
+      ? `The brightest frames are ${figure(ratio, 2)} times as bright as the darkest. With “Match scale” each job is shown on its own scale.`
+      : "Off: all jobs share one contrast, so that differences in brightness are visible. On: each job has its own.");
+    spreads.forEach((spread, index) => sampled({ base: this.base(index, middle), ...spread }).then((values) => this.contrasts[index].distribution(values)).catch(() => {}));
+    this.rescale();
+    this.choose("beside");
+  }
+
+  /** Gives each job its own contrast, or all the same one. */
+  rescale() {
+    const { spreads } = this;
     const least = (name) => Math.min(...spreads.map((spread) => spread[name]));
     const most = (name) => Math.max(...spreads.map((spread) => spread[name]));
-    this.spread = { ...spreads[0], minimum: least("minimum"), maximum: most("maximum"), low: least("low"), high: most("high") };
-    this.contrast.offer(this.spread);
-    this.choose("beside");
+    const shared = { low: least("low"), high: most("high") };
+    this.contrasts.forEach((contrast, index) => {
+      const range = this.match.checked ? {} : { minimum: least("minimum"), maximum: most("maximum") };
+      contrast.offer({ ...spreads[index], ...range });
+      const { low, high } = this.match.checked ? spreads[index] : shared;
+      contrast.set(low, high > low ? high : low + 1);
+    });
+    if (this.modes) this.show();
+  }
+
+  /** Takes a change of one contrast to the others, unless each has its own. */
+  adjust(from) {
+    if (!this.match.checked) this.contrasts.filter((other) => other !== from).forEach((other) => other.set(from.low, from.high));
+    this.show();
   }
 
   choose(mode) {
@@ -163,21 +194,23 @@ class Group {
 
   show() {
     const { frame } = this.player;
-    const window = this.contrast.window();
-    const [black, white] = window;
+    const window = (index) => this.contrasts[index].window();
     const first = this.panes[0];
     if (this.mode === "beside") {
+      this.contrasts.forEach(({ element }) => (element.hidden = false));
       this.panes.forEach((pane, index) => {
         pane.lay(null);
-        pane.show(this.source(index, frame), ...window);
+        pane.show(this.source(index, frame), ...window(index));
         say(pane.title, nameOf(this.jobs[index]));
       });
       return;
     }
     const [one, other] = this.pair();
+    this.contrasts.forEach(({ element }, index) => (element.hidden = ![one, other].includes(index)));
+    const [black, white] = window(other);
     const shown = this.mode === "flicker" && this.turn === 1 ? other : one;
     const over = { ...this.source(other, frame), black, white };
-    first.show(this.source(shown, frame), ...window);
+    first.show(this.source(shown, frame), ...window(shown));
     if (this.mode === "wipe") {
       const at = Number(this.wipe.value) / 1000;
       this.handle.style.left = `${100 * at}%`;
@@ -196,7 +229,7 @@ class Group {
     this.timer = setTimeout(() => {
       const index = this.pair()[1 - this.turn];
       // Switch only when the other frame is loaded, so that no blank frame appears.
-      if (this.panes[0].prepare(this.source(index, this.player.frame), ...this.contrast.window())) {
+      if (this.panes[0].prepare(this.source(index, this.player.frame), ...this.contrasts[index].window())) {
         this.turn = 1 - this.turn;
         this.show();
       }

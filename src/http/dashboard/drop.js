@@ -58,14 +58,20 @@ export function dropZone(id, title, hint, signal, take, many = false) {
     event.preventDefault();
     start([...event.dataTransfer.files]);
   });
-  return { element: h("div", null, zone, status), status };
+  /** Shows that no file is held. */
+  const clear = () => {
+    say(text, hint);
+    put(status);
+  };
+  return { element: h("div", null, zone, status), status, clear };
 }
 
 /** An error message with all invalid fields. */
 export function problem(error, about = null) {
   const errors = error.errors ?? [];
   const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: ${item.detail}`))) : null;
-  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : error.message, list);
+  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : error.message, list,
+    error.code && error.code !== "unknown" && h("p", null, h("a", { href: `/problems/${error.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
 }
 
 const SCALES = [1, 255, 1023, 4095, 16383, 65535];

@@ -70,11 +70,17 @@ export function nameOf(thing) {
   return thing.label ?? thing.name ?? `unnamed ${short(thing.id)}`;
 }
 
-/** "8 × 256 × 256", and the number of snapshots if there are several. */
-export function shapeOf(job) {
+/** "frame 12", or "band 12 · 540 nm" of a spectral camera. */
+export function frameName({ dispersion }, frame) {
+  const wavelength = dispersion?.wavelengths?.[frame - 1];
+  return `${dispersion ? "band" : "frame"} ${frame}${wavelength === undefined ? "" : ` · ${figure(wavelength, 4)} nm`}`;
+}
+
+/** "8 × 256 × 256", and with `all` the number of snapshots if there are several. */
+export function shapeOf(job, all = true) {
   const { frames, height, width, mosaic } = job.shape;
   const count = job.snapshots.count;
-  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : ""}${count > 1 ? `, ${count} snapshots` : ""}`;
+  return `${frames} × ${height} × ${width}${mosaic ? " in colour" : job.dispersion ? ", bands" : ""}${all && count > 1 ? `, ${count} snapshots` : ""}`;
 }
 
 /** Current stage of a job. */
@@ -108,17 +114,30 @@ export function iterationsOf(schedule) {
   return schedule.stages.reduce((sum, stage) => sum + stage.iterations, 0);
 }
 
-/** A succeeded job in one word, as kind and text: its findings limit the grade of its expected PSNR. */
-export function verdictOf(job) {
-  if (job.warnings.some((item) => item.severity === "error")) return ["bad", "bad"];
-  if (job.warnings.length > 0 || job.assessment?.psnr_db === null) return ["usable", "doubtful"];
-  return job.assessment ? [job.assessment.grade, job.assessment.grade] : ["unknown", "not judged"];
+/**
+ * The verdict on a job's frames, as kind, word, title and reason: its findings limit the grade of its expected PSNR. The
+ * list shows the word, the job's page the title and the reason.
+ */
+export function verdictOf(job, assessment = job.assessment) {
+  if (job.warnings.some((item) => item.severity === "error")) return ["bad", "bad", "Bad", "The checks found errors that make the frames wrong:"];
+  if (job.warnings.length > 0) return ["usable", "doubtful", "Doubtful", "The checks found problems that may degrade the frames:"];
+  if (assessment?.psnr_db === null) return ["usable", "doubtful", "Doubtful", "The quality of these frames can’t be predicted:"];
+  if (assessment) return [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `Measurement and calibration fit each other. ${LIKE[assessment.grade]}`];
+  return ["unknown", "not judged", "Not judged", "Measurement and calibration fit each other. No quality can be predicted for this algorithm or sensor. Attach true frames, if you have them, to measure it."];
 }
+
+/** The look of frames of a grade. */
+const LIKE = {
+  good: "Frames like these are close to the scene.",
+  usable: "Frames like these lack texture.",
+  bad: "Frames like these show only coarse shapes correctly.",
+};
 
 /** Number and highest severity of a job's findings; null if there are none. */
 export function doubts(job) {
-  const errors = job.warnings.filter((item) => item.severity === "error").length;
-  const warnings = job.warnings.length - errors;
+  // A finding counts once, even if several snapshots have it.
+  const distinct = (severity) => new Set(job.warnings.filter((item) => item.severity === severity).map((item) => item.code)).size;
+  const [errors, warnings] = [distinct("error"), distinct("warning")];
   const count = (number, word) => number > 0 && `${number} ${word}${number > 1 ? "s" : ""}`;
   if (job.warnings.length === 0) return null;
   return { severity: errors > 0 ? "error" : "warning", text: [count(errors, "error"), count(warnings, "warning")].filter(Boolean).join(", ") };

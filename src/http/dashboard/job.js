@@ -28,7 +28,7 @@ export async function job(root, [id], signal) {
   root.append(
     h("div", { class: "row head" }, title, state, snapshot.element, h("span", { class: "grow" }), buttons),
     progress, problem,
-    h("div", { class: "stage" }, h("div", { class: "side" }, verdict.element, files, viewer.beside), viewer.element),
+    h("div", { class: "stage three" }, verdict.element, viewer.element, h("div", { class: "side" }, viewer.beside, files)),
     h("div", { class: "cards" }, made.element, h("div", { class: "stack" }, tiles.plotCard, tiles.tilesCard)));
   camera(found, viewer, signal);
 
@@ -50,8 +50,8 @@ export async function job(root, [id], signal) {
     if (now === shown) return;
     if (now.state !== shown?.state) {
       put(state, h("span", { class: `badge ${now.state}` }, now.state));
-      put(buttons, renaming, actions(now, (action) => (action === "delete" ? leave() : refresh(null))));
-      put(problem, now.error && h("p", { class: "trouble", role: "alert" }, now.error));
+      put(buttons, actions(now, (action) => (action === "delete" ? leave() : refresh(null)), [renaming]));
+      put(problem, now.error && failure(now));
       if (shown) announce(`The job is ${now.state}`);
     }
     call(nameOf(now));
@@ -83,14 +83,22 @@ export async function job(root, [id], signal) {
   watch(refresh, signal);
 }
 
-/** Sets the true frame rate if the camera's times are known. */
+/** Sets the full scale, and the true frame rate if the camera's times are known. */
 async function camera(found, viewer, signal) {
   try {
-    const { camera_fps: fps, exposure_s: exposure } = await get(`/v1/measurements/${found.measurement}`, signal);
+    const { camera_fps: fps, exposure_s: exposure, full_scale: scale } = await get(`/v1/measurements/${found.measurement}`, signal);
+    viewer.setFullScale(scale);
     viewer.player.setTrueRate(exposure ? found.shape.frames / exposure : fps ? found.shape.frames * fps : null);
   } catch {
     // Without the camera's times the player shows no true speed.
   }
+}
+
+/** The failure of a job: its reason, the remedy, and the page that explains it. */
+function failure({ error, problem }) {
+  return h("div", { class: "trouble", role: "alert" }, h("p", null, error),
+    problem?.remedy && h("p", null, h("b", null, "What to do: "), problem.remedy),
+    problem && h("p", null, h("a", { href: `/problems/${problem.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
 }
 
 /** Field that selects the snapshot of a job with several. */
@@ -113,7 +121,7 @@ function line(now) {
     now.state !== "succeeded" && `${percent.toFixed(percent < 10 ? 1 : 0)} %`,
     stageOf(now),
     timeOf(now),
-    `${done} of ${total} ${total === 1 ? "tile" : "tiles"}`,
+    total > 1 && `${done} of ${total} tiles`,
   ];
   const text = h("span", null, parts.filter(Boolean).join(" · "));
   return now.state === "succeeded" ? text : [h("progress", { max: 100, value: percent, "aria-label": "Progress" }), text];
@@ -146,6 +154,6 @@ async function showFiles(element, { id, state, shape, snapshots: { count } }, sn
     ready && movieLink(base, snapshot, "gif", "GIF for presentations", signal),
     ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "mp4", "Movie of all snapshots", signal),
     ready && state === "succeeded" && made(`${base}/exports/zip`, "All files as ZIP"),
-    h("details", null, h("summary", null, `Single frames (${single.length} files)`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
+    h("details", null, h("summary", null, `${shape.frames} single frames as EXR and PNG`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;
 }

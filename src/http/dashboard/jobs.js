@@ -197,7 +197,7 @@ function columns(chosen, choose, done) {
     { title: "Job", class: "name", fill: name },
     { title: "Verdict", class: "checks", fill: verdict },
     { title: "State", class: "state", fill: state },
-    { title: "Frames", class: "shape", fill: (cell, job) => say(cell, shapeOf(job)) },
+    { title: "Frames", class: "shape", fill: frames },
     { title: "Submitted", class: "created", fill: created },
     { title: h("span", { class: "unseen" }, "Actions"), class: "actions writes", fill: (cell, job, before) => buttons(cell, job, before, done) },
   ];
@@ -256,6 +256,12 @@ function verdict(cell, job, before) {
       found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text),
       found && psnr !== null && " · ",
       psnr !== null && h("span", { title: `Expected PSNR ${expectedRange(job.assessment)}` }, `about ${aboutDecibels(psnr)}`)));
+}
+
+function frames(cell, job) {
+  if (cell.firstChild) return;
+  const { count } = job.snapshots;
+  put(cell, shapeOf(job, false), count > 1 && h("span", { class: "sub" }, `${count} snapshots`));
 }
 
 function created(cell, job) {

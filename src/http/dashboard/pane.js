@@ -2,10 +2,13 @@
 
 import { h, say } from "./dom.js";
 import { isAborted, picture } from "./api.js";
+import { figure } from "./format.js";
+import { pixel } from "./values.js";
 import { steer } from "./view.js";
 
 /** Largest number of tiles in the cache, which drops the least recently used. */
 const MAX_TILES = 500;
+const HINT = "Point at a pixel to read its value.";
 const tiles = new Map();
 let waiting = [];
 let busy = 0;
@@ -71,7 +74,12 @@ export class Pane {
     this.note = h("p", { class: "note", hidden: true });
     this.badge = h("p", { class: "onpicture", hidden: true });
     this.sight = h("div", { class: "sight" }, this.canvas, this.note, this.badge);
-    this.element = h("figure", { class: "pane" }, h("figcaption", null, this.title, this.tools), this.sight);
+    // The frame takes the shape of the picture, so that nothing around it is black.
+    this.sight.style.setProperty("--ratio", String(view.width / view.height));
+    this.readout = h("p", { class: "readout muted" }, HINT);
+    this.element = h("figure", { class: "pane" }, h("figcaption", null, this.title, this.tools), this.sight, this.readout);
+    /** Words for a value of the picture. */
+    this.describe = (value) => value.map((one) => figure(one, 4)).join(", ");
     this.generation = 0;
     this.source = null;
     this.over = null;
@@ -92,6 +100,28 @@ export class Pane {
     this.source = source && { ...source, black, white };
     if (source) this.canvas.setAttribute("aria-label", source.label);
     this.redraw();
+  }
+
+  /** Shows row, column and value of the pixel at a position of the pointer; null clears them. */
+  async hover(at) {
+    const { height, width } = this.view;
+    const [row, column] = at ? [Math.floor(at.y), Math.floor(at.x)] : [-1, -1];
+    if (!this.source || row < 0 || column < 0 || row >= height || column >= width) {
+      this.pointed = null;
+      say(this.readout, HINT);
+      return;
+    }
+    const { base, label } = this.source;
+    const key = `${base} ${row} ${column}`;
+    if (this.pointed === key) return;
+    this.pointed = key;
+    const place = `Row ${row}, column ${column}`;
+    try {
+      const value = await pixel({ base, height, width, version: this.generation }, row, column);
+      if (this.pointed === key) say(this.readout, `${place}: ${this.describe(value)}`);
+    } catch {
+      if (this.pointed === key) say(this.readout, `${place} of ${label}`);
+    }
   }
 
   /** Overlays a second image as a wipe, right of a fraction of the width, or as a difference; null removes it. */

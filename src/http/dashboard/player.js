@@ -6,10 +6,10 @@ import { h, put, say } from "./dom.js";
 /** Highest playback rate in frames per second, the refresh rate of fast screens. */
 const MAX_RATE = 240;
 
-/** Player of `count` frames; calls `show(frame)` with 1 to `count`. */
+/** Player of `count` frames; calls `show(frame)` with 1 to `count`. `nameOf` returns the name of a frame to display, if its number is not enough. */
 export class Player {
-  constructor(count, signal, show) {
-    Object.assign(this, { count, show, frame: 1, playing: false, ahead: () => true, onward: () => false });
+  constructor(count, signal, show, nameOf = null) {
+    Object.assign(this, { count, show, nameOf, frame: 1, playing: false, ahead: () => true, onward: () => false });
     this.slider = h("input", { type: "range", id: "frame", min: 1, max: count, value: 1, "aria-label": "Frame" });
     this.slider.addEventListener("input", () => this.go(Number(this.slider.value)));
     this.button = h("button", { type: "button", id: "play", "aria-pressed": "false", onclick: () => this.toggle() }, "Play");
@@ -59,8 +59,9 @@ export class Player {
 
   showPosition() {
     this.slider.value = this.frame;
-    this.slider.setAttribute("aria-valuetext", `frame ${this.frame} of ${this.count}`);
-    say(this.text, `${this.frame} / ${this.count}`);
+    const name = this.nameOf?.(this.frame);
+    this.slider.setAttribute("aria-valuetext", `${name ?? `frame ${this.frame}`} of ${this.count}`);
+    say(this.text, name ?? `${this.frame} / ${this.count}`);
   }
 
   toggle() {

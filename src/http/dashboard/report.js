@@ -7,10 +7,34 @@ import { isAborted, get } from "./api.js";
 /** List of findings with their remedies; null if there are none. */
 export function findings(found) {
   if (!found?.length) return null;
-  const about = (item) => (item.snapshot !== undefined && item.snapshot !== null ? `Snapshot ${item.snapshot}: ` : "");
-  return h("ul", { class: "findings" }, found.map((item) => h("li", { class: item.severity },
-    h("p", null, h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about(item), item.detail),
-    item.remedy && h("p", null, h("b", null, "What to do: "), item.remedy))));
+  return h("ul", { class: "findings" }, repeated(found).map((same) => {
+    const [item] = same;
+    const about = same.length > 1 ? `${same.length} snapshots (${ranges(same.map(({ snapshot }) => snapshot))}); in snapshot ${item.snapshot}: ` : Number.isInteger(item.snapshot) ? `Snapshot ${item.snapshot}: ` : "";
+    return h("li", { class: item.severity },
+      h("p", null, h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about, item.detail),
+      item.remedy && h("p", null, h("b", null, "What to do: "), item.remedy));
+  }));
+}
+
+/** The findings in groups: one code and severity in several snapshots is one group. */
+export function repeated(found) {
+  const groups = new Map();
+  found.forEach((item, index) => {
+    const key = Number.isInteger(item.snapshot) ? `${item.code} ${item.severity}` : `alone ${index}`;
+    groups.set(key, [...(groups.get(key) ?? []), item]);
+  });
+  return [...groups.values()];
+}
+
+/** [0, 1, 2, 5] -> "0 to 2, 5". */
+function ranges(numbers) {
+  const sorted = [...numbers].sort((one, other) => one - other);
+  const runs = [];
+  for (const number of sorted) {
+    if (runs.at(-1)?.[1] === number - 1) runs.at(-1)[1] = number;
+    else runs.push([number, number]);
+  }
+  return runs.map(([first, last]) => (first === last ? first : `${first} to ${last}`)).join(", ");
 }
 
 /** Milliseconds between requests for a grade that does not exist yet. */

@@ -1,4 +1,4 @@
-// Data stored in the browser: saved filters, the true frames of jobs, and the selected lab.
+// Data stored in the browser: saved filters and the selected lab.
 
 /** Value stored under a name, or `otherwise`. */
 export function recall(name, otherwise) {
@@ -34,17 +34,4 @@ export function selectLab(lab) {
   } catch {
     // Storage may be disabled; nothing depends on it.
   }
-}
-
-/** Jobs for which true frames are remembered. */
-const MAX_TRUTHS = 200;
-
-/** The true frames of a job: `{sha256, name, snapshot}`, or null. */
-export function truthOf(job) {
-  return recall("truths", []).find((entry) => entry.job === job)?.truth ?? null;
-}
-
-export function keepTruth(job, truth) {
-  const others = recall("truths", []).filter((entry) => entry.job !== job);
-  remember("truths", [{ job, truth }, ...others].slice(0, MAX_TRUTHS));
 }

@@ -6,13 +6,13 @@ import { bytes, duration, exact, figure } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings, grade } from "./report.js";
 import { create, isAborted, get, send } from "./api.js";
-import { given, numberField, textField } from "./fields.js";
+import { given, numberField, partFields, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
 const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
 
 export async function submit(root, [query], signal) {
-  const form = { calibration: null, measurement: null };
+  const form = { calibration: null, measurement: null, truth: null };
   const [known, algorithms] = await Promise.all([get("/v1/calibrations?limit=200", signal), get("/v1/algorithms", signal)]);
   const button = h("button", { type: "submit", class: "primary large", disabled: true }, "Submit the job");
   const result = h("div", { "aria-live": "polite" });
@@ -88,12 +88,14 @@ function stored(known, wanted, use, signal) {
 function masks(settings, sensor, use, verdict, signal) {
   // The file that was dropped last, with the full scale and axes stated for it.
   let last = null;
+  const repeat = () => last && make(...last).catch((error) => put(verdict, problem(error)));
+  const part = partFields("masks-part", true, repeat);
   const make = async (sha256, stated) => {
     last = [sha256, stated];
     use(null);
     put(verdict);
     try {
-      const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...stated }, signal);
+      const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...part.value(), ...stated }, signal);
       const again = (full_scale) => make(sha256, { ...stated, full_scale }).catch((later) => put(verdict, problem(later)));
       put(verdict, accepted(item, signal), h("details", null, h("summary", null, `Full scale of the masks: ${exact(item.full_scale)}`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
@@ -104,9 +106,9 @@ function masks(settings, sensor, use, verdict, signal) {
     }
   };
   // A change of the sensor repeats the request with the same file.
-  sensor.addEventListener("change", () => last && make(...last).catch((error) => put(verdict, problem(error))));
+  sensor.addEventListener("change", repeat);
   const drop = dropZone("masks", "Calibration set", `one mask per frame: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
-  return { element: drop.element };
+  return { element: h("div", null, drop.element, part.element) };
 }
 
 function captures(settings, use, verdict, signal) {
@@ -165,6 +167,7 @@ function measurementStep(form, changed, signal) {
     forget.hidden = darks.length === 0;
     if (last) make(last, known).catch((error) => put(verdict, problem(error)));
   };
+  const part = partFields("data-part", false, () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   // The file that was dropped last, the full scale and axes stated for it, and the number of the latest attempt.
   let [last, known, attempt] = [null, {}, 0];
   const make = async (sha256, stated = {}) => {
@@ -173,7 +176,7 @@ function measurementStep(form, changed, signal) {
     form.measurement = null;
     changed();
     put(verdict);
-    const body = { name: name.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
+    const body = { name: name.value(), ...part.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
     const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
     [last, known] = [sha256, stated];
     try {
@@ -184,7 +187,7 @@ function measurementStep(form, changed, signal) {
       form.measurement = item;
     } catch (error) {
       if (mine !== attempt) return;
-      const question = askAbout(error, stated, again);
+      const question = askAbout(error, stated, again) ?? (error.code === "size_mismatch" && askWindow(form.calibration, part));
       if (!question) {
         last = null;
         throw error;
@@ -206,7 +209,7 @@ function measurementStep(form, changed, signal) {
   }, true);
   const inside = h("div", { hidden: true },
     h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Sequence of snapshots", sequence)),
-    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))));
+    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))), part.element);
   const wake = () => {
     attempt += 1;
     inside.hidden = !form.calibration;
@@ -218,6 +221,13 @@ function measurementStep(form, changed, signal) {
     changed();
   };
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
+}
+
+/** Offers a window of the snapshots with the size of the masks. */
+function askWindow({ height, width }, part) {
+  return h("div", { class: "askscale", role: "group", "aria-label": "Window" },
+    h("p", null, h("b", null, `Does the file hold a window of ${height} × ${width} pixels that the masks show?`), " Enter its first row and column below. Otherwise select the calibration of this camera setting above."),
+    h("div", { class: "row" }, h("button", { type: "button", class: "small", onclick: () => part.propose(height, width) }, `Use a window of ${height} × ${width}`)));
 }
 
 function fits(item) {
@@ -239,7 +249,7 @@ function jobStep(algorithms, form, signal) {
   const priority = numberField("priority", "Priority (−100 to 0; admins up to 100)", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
-  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value() }) });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth }) });
   const ask = calmly(250, async () => {
     if (!form.measurement || signal.aborted) return;
     const asked = JSON.stringify(request());
@@ -256,9 +266,19 @@ function jobStep(algorithms, form, signal) {
     if (!form.measurement) put(estimate);
     ask();
   };
+  const truth = dropZone("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, async (blob) => {
+    form.truth = blob.sha256;
+    ask();
+  });
+  const forget = h("button", { type: "button", class: "small", onclick: () => {
+    form.truth = null;
+    truth.clear();
+    ask();
+  } }, "Remove the true frames");
   select.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan, estimate);
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan,
+    h("details", null, h("summary", null, "True frames"), truth.element, h("div", { class: "row" }, forget)), estimate);
   queueMicrotask(renew);
   return { element, renew, request };
 }

@@ -1,21 +1,34 @@
-// State of the service: workers, device, queue, disk, versions.
+// State of the service: what an administrator looks for first, in words.
 
 import { facts, h, put } from "./dom.js";
-import { bytes, duration, moment, momentInFull, short } from "./format.js";
+import { bytes, duration, moment, momentInFull, nameOf, short } from "./format.js";
 import { every } from "./live.js";
 import { get } from "./api.js";
 
+/** Number of failed jobs that are listed. */
+const MAX_FAILED = 5;
+
 export async function system(root, _, signal) {
-  const body = h("div", { class: "cards" });
+  const body = h("div");
   root.append(h("h1", null, "System"), body);
   let before = "";
   every(2000, async () => {
-    const found = await get("/v1/system", signal);
-    const text = JSON.stringify({ ...found, now: "" });
+    const [found, failed] = await Promise.all([get("/v1/system", signal), get(`/v1/jobs?state=failed&limit=${MAX_FAILED}`, signal)]);
+    const text = JSON.stringify([{ ...found, now: "" }, failed]);
     if (text === before) return;
     before = text;
-    put(body, service(found), queue(found), disk(found), workers(found));
+    put(body, h("p", { class: "lead" }, summary(found)), found.degraded.map((trouble) => h("p", { class: "trouble" }, trouble)),
+      h("div", { class: "cards" }, queue(found), workers(found), disk(found), errors(failed), service(found)));
   }, signal);
+}
+
+const count = (number, one, many = `${one}s`) => `${number === 0 ? "no" : number} ${number === 1 ? one : many}`;
+
+/** The state in one sentence. */
+function summary({ jobs, workers: { length: alive }, disk: { free_bytes: free } }) {
+  const [running, queued] = [jobs.running + jobs.cancelling, jobs.queued];
+  const work = running + queued === 0 ? "No job runs or waits" : `${count(running, "job")} running, ${queued || "none"} waiting`;
+  return `${work[0].toUpperCase()}${work.slice(1)}; ${count(alive, "worker")} ready; ${bytes(free)} free.`;
 }
 
 function card(title, ...content) {
@@ -25,25 +38,24 @@ function card(title, ...content) {
 function service(found) {
   return card("Service", facts([
     ["Version", found.version],
-    ["Device", found.device],
-    ["Provider", found.provider],
+    ["Networks run on", `${found.device} (${found.provider})`],
     ["ONNX Runtime", found.onnxruntime ?? "not used yet"],
-    ["Uptime", duration((new Date(found.now) - new Date(found.started_at)) / 1000)],
+    ["Running for", duration((new Date(found.now) - new Date(found.started_at)) / 1000)],
     ["Largest upload", bytes(found.limits.upload_bytes)],
-    ["Memory of a worker", bytes(found.limits.worker_memory_bytes)],
-    ["API description", h("a", { href: "/openapi.yaml" }, "openapi.yaml")],
-    ["Metrics", h("a", { href: "/metrics" }, "metrics for Prometheus")],
+    ["Memory of a worker", `at most ${bytes(found.limits.worker_memory_bytes)}`],
+    ["Interfaces", [h("a", { href: "openapi.yaml" }, "API description"), ", ", h("a", { href: "metrics" }, "metrics for Prometheus")]],
   ]));
 }
 
+const STATES = [["running", "Running"], ["queued", "Waiting"], ["cancelling", "Stopping"], ["succeeded", "Succeeded"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
+
 function queue(found) {
-  const states = Object.entries(found.jobs).map(([state, count]) => [h("span", { class: `badge ${state}` }, state), h("a", { href: `#/jobs?state=${state}` }, String(count))]);
-  return card("Queue", facts([
-    ["Running tasks", found.queue.running],
-    ["Ready tasks", found.queue.ready],
-    ["Blocked tasks", found.queue.blocked],
-    ...states,
-  ]));
+  const jobs = ([state, word]) => [word, found.jobs[state] === 0 ? "none" : h("a", { href: `#/jobs?state=${state}` }, count(found.jobs[state], "job"))];
+  const { running, ready, blocked } = found.queue;
+  const open = ["running", "queued", "cancelling"];
+  return card("Queue", facts(STATES.filter(([state]) => state !== "cancelling" || found.jobs[state] > 0).map(jobs)),
+    h("p", { class: "muted" }, open.some((state) => found.jobs[state] > 0) || running + ready + blocked > 0
+      ? `Tasks: ${running} running, ${ready} ready for a worker, ${blocked} waiting for others.` : "No tasks are open."));
 }
 
 function disk(found) {
@@ -52,20 +64,28 @@ function disk(found) {
   return card("Disk",
     h("meter", { min: 0, max: size, value: size - free, high: size - 2 * reserved, "aria-label": `${bytes(size - free)} of ${bytes(size)} in use` }),
     facts([
-      ["Free", h("span", { class: low ? "warn" : null }, `${bytes(free)} of ${bytes(size)}`)],
-      ["Reserved", bytes(reserved)],
-      ["Stored files", `${found.disk.files}, ${bytes(found.disk.file_bytes)}`],
+      ["Free", h("span", { class: low ? "warn" : null }, `${bytes(free)} of ${bytes(size)}${low ? ": delete jobs, or give the service a larger disk" : ""}`)],
+      ["Kept free", `${bytes(reserved)}; uploads are refused below it`],
+      ["Stored", `${bytes(found.disk.file_bytes)} in ${count(found.disk.files, "file")}`],
     ]));
 }
 
+/** The jobs that failed last, with their reasons. */
+function errors({ items }) {
+  if (items.length === 0) return card("Last errors", h("p", { class: "muted" }, "No job of this lab has failed."));
+  return card("Last errors", h("ul", { class: "findings" }, items.map((job) => h("li", { class: "error" },
+    h("p", null, h("a", { href: `#/jobs/${job.id}` }, nameOf(job)), " ", h("span", { class: "muted" }, moment(job.finished_at))),
+    h("p", null, job.error)))));
+}
+
 function workers(found) {
-  const title = `Workers: ${found.workers.length} of ${found.workers_wanted}`;
-  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait."));
+  const title = `Workers: ${found.workers.length} of ${found.workers_wanted} ready`;
+  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait. Start the service with --workers 1 or more, or connect workers of other machines."));
   const row = (worker) => h("tr", null,
-    h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version),
+    h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version), h("td", null, worker.device ?? ""),
     h("td", null, task(worker.task)),
     h("td", { title: momentInFull(worker.started_at) }, moment(worker.started_at)));
-  const heads = ["Worker", "Process", "Version", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
+  const heads = ["Worker", "Process", "Version", "Device", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
   return card(title, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Workers" },
     h("table", null, h("thead", null, h("tr", null, heads)), h("tbody", null, found.workers.map(row)))));
 }

@@ -13,11 +13,12 @@ export class TileMap {
     this.map = h("div");
     this.select = h("select", { id: "tile" });
     this.select.addEventListener("change", () => this.choose(this.select.value === "" ? null : Number(this.select.value)));
+    this.label = h("label", { for: "tile", class: "row muted" }, "of tile", this.select);
     this.note = h("p", { class: "muted" });
     this.plot = h("div");
     this.tilesCard = h("section", { class: "card", "aria-label": "Tiles" }, h("h2", null, "Tiles"), this.map, this.note);
     this.plotCard = h("section", { class: "card", "aria-label": "Convergence" },
-      h("h2", { class: "row" }, "Convergence", h("span", { class: "grow" }), h("label", { for: "tile", class: "row muted" }, "of tile", this.select)), this.plot);
+      h("h2", { class: "row" }, "Convergence", h("span", { class: "grow" }), this.label), this.plot);
   }
 
   async renew(snapshot) {
@@ -80,6 +81,8 @@ export class TileMap {
         this.choose(tile.tile);
       },
     }, s("title", null, `tile ${tile.tile + 1}${job.shape.mosaic ? ` (${COLOURS[job.shape.mosaic[tile.plane]]})` : ""}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
+    // A single tile is the whole picture: neither a map nor a choice is needed.
+    this.tilesCard.hidden = this.label.hidden = this.tiles.length === 1;
     put(this.map, s("svg", { viewBox: `0 0 ${width} ${height}`, class: "tiles", role: "img", "aria-label": text }, this.tiles.map(rectangle)));
     const most = iterationsOf(this.job.schedule);
     const runs = this.tiles.filter((tile) => tile.state === "running" && tile.iterations > 0);

@@ -1,16 +1,17 @@
 // The card "Is it good?": findings of the checks, grade of the calibration, expected PSNR, and the PSNR and
 // SSIM against true frames if they are attached.
 
-import { aboutDecibels, bytes, expectedRange, figure } from "./format.js";
-import { facts, h, put, say } from "./dom.js";
+import { ask } from "./actions.js";
+import { aboutDecibels, bytes, expectedRange, figure, verdictOf } from "./format.js";
+import { h, put, say } from "./dom.js";
 import { findings } from "./report.js";
-import { isAborted, get, upload } from "./api.js";
-import { keepTruth, truthOf } from "./storage.js";
+import { isAborted, get, send, upload } from "./api.js";
+import { csvLink, plot } from "./plot.js";
 
 /** The card; `show(job, manifest, snapshot)` updates it. The manifest is null until the snapshot is written. */
 export class Verdict {
   constructor(job, signal) {
-    Object.assign(this, { job, signal, truth: truthOf(job.id) });
+    Object.assign(this, { job, signal, truth: job.truth });
     this.title = h("p", { class: "judgement" });
     this.why = h("p", { class: "muted" });
     this.found = h("div", null, findings(job.warnings));
@@ -19,10 +20,11 @@ export class Verdict {
     this.calibration = h("p", { class: "muted" });
     const input = h("input", { type: "file", id: "truth", class: "unseen" });
     input.addEventListener("change", () => this.attach(input.files[0]));
-    this.attaching = h("label", { for: "truth", class: "button small filebutton" }, "Attach true frames", input);
+    this.attaching = h("label", { for: "truth", class: "button small filebutton writes" }, "Attach true frames", input);
+    this.removing = h("button", { type: "button", class: "small writes", hidden: true, onclick: () => this.remove() }, "Remove the true frames");
     this.status = h("span", { class: "muted", "aria-live": "polite" });
     this.element = h("section", { class: "card verdictcard", "aria-label": "Is it good?" }, h("h2", null, "Is it good?"),
-      this.title, this.why, this.found, this.measured, this.expected, h("div", { class: "row" }, this.attaching, this.status), this.calibration);
+      this.title, this.why, this.found, this.measured, this.expected, h("div", { class: "row" }, this.attaching, this.removing, this.status), this.calibration);
     this.grade();
   }
 
@@ -31,8 +33,6 @@ export class Verdict {
     const link = (text) => h("a", { href: `#/calibrations/${this.job.calibration}` }, text);
     try {
       const { grade } = await get(`/v1/calibrations/${this.job.calibration}/report`, this.signal);
-      this.graded = grade;
-      if (this.written && !this.truth) this.unmeasured();
       put(this.calibration, "The ", link("calibration"), " is ", h("span", { class: `grade ${grade}` }, grade), ".");
     } catch (error) {
       if (!isAborted(error)) put(this.calibration, "The ", link("calibration"), " has no grade yet.");
@@ -41,8 +41,9 @@ export class Verdict {
 
   async show(job, manifest, snapshot) {
     const written = manifest !== null;
-    Object.assign(this, { written, snapshot, state: job.state });
-    this.attaching.hidden = !written;
+    Object.assign(this, { job, snapshot, truth: job.truth });
+    this.attaching.hidden = !written || this.truth !== null;
+    this.removing.hidden = !written || this.truth === null;
     if (!written) {
       const words = { failed: ["Failed", "bad"], cancelled: ["Cancelled", ""], cancelling: ["Being cancelled", ""] }[job.state] ?? ["Not known yet", ""];
       this.judge(...words, job.state in { failed: 1, cancelled: 1, cancelling: 1 } ? "The frames are incomplete: don’t rely on them." : "The frames are judged when they are written.");
@@ -51,7 +52,7 @@ export class Verdict {
       return;
     }
     this.showExpected(manifest.content?.assessment);
-    if (this.truth) await this.compare();
+    if (this.truth) await this.compare(this.truth);
     else this.unmeasured();
   }
 
@@ -76,63 +77,69 @@ export class Verdict {
   }
 
   unmeasured() {
-    const poor = this.graded === "usable" || this.graded === "bad";
-    const errors = this.job.warnings.some((item) => item.severity === "error");
-    const warned = this.job.warnings.length > 0;
-    if (errors) this.judge("Bad", "bad", "The checks found errors that make the frames wrong:");
-    else if (warned) this.judge("Doubtful", "usable", "The checks found problems that may degrade the frames:");
-    else if (this.assessment) this.judge(...EXPECTED[this.assessment.grade]);
-    else if (poor) this.judge("Doubtful", "usable", `The measurement fits its calibration, but the grade of the calibration is “${this.graded}”. Its report gives the reasons.`);
-    else this.judge("No problems found", "", "Measurement and calibration fit each other. This does not measure the quality of the frames. Attach true frames, if you have them, to measure it.");
+    const [kind, , title, why] = verdictOf(this.job, this.assessment ?? null);
+    this.judge(title, kind, why);
+    put(this.measured);
   }
 
+  /** Uploads true frames, compares them, and attaches them to the job for all its readers. */
   async attach(file) {
     if (!file) return;
     try {
       const { sha256 } = await upload(file, (done, total) => say(this.status, `${bytes(done)} of ${bytes(total)}`), this.signal);
-      this.truth = { sha256, name: file.name };
-      say(this.status, "");
-      if (await this.compare()) keepTruth(this.job.id, this.truth);
+      if (await this.compare(sha256)) await this.change(sha256);
     } catch (error) {
       if (!isAborted(error)) put(this.status, h("span", { class: "warn" }, error.message));
     }
   }
 
-  /** Shows PSNR and SSIM against the true frames; false if they could not be computed. */
-  async compare() {
-    const { sha256, name } = this.truth;
+  async remove() {
+    if (!(await ask("Remove the true frames?", "Nobody will see the measured PSNR of this job. The uploaded file is kept.", "Remove"))) return;
+    try {
+      await this.change(null);
+      this.unmeasured();
+    } catch (error) {
+      put(this.status, h("span", { class: "warn" }, error.message));
+    }
+  }
+
+  async change(truth) {
+    this.job = await send("PATCH", `/v1/jobs/${this.job.id}`, { truth });
+    this.truth = truth;
+    this.attaching.hidden = truth !== null;
+    this.removing.hidden = truth === null;
+  }
+
+  /** Shows PSNR and SSIM against true frames; false if they could not be computed. */
+  async compare(truth) {
     say(this.status, "Comparing with the true frames …");
     let found;
     try {
-      found = await get(`/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/quality?truth=${sha256}`, this.signal);
+      found = await get(`/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/quality?truth=${truth}`, this.signal);
     } catch (error) {
       if (isAborted(error)) throw error;
       put(this.status, h("span", { class: "warn" }, error.message));
-      this.truth = null;
       this.unmeasured();
       return false;
     }
     say(this.status, "");
     const [text, kind, meaning] = LEVELS.find(([, , , least]) => (found.psnr ?? Infinity) >= least);
     this.judge(found.psnr === null ? "Identical to the true frames" : text, kind, meaning);
-    put(this.measured, h("p", { class: "quality" }, h("b", null, found.psnr === null ? "∞" : `${figure(found.psnr, 3)} dB`), " PSNR", found.ssim !== null && [", ", h("b", null, figure(found.ssim, 3)), " SSIM"]),
-      h("p", { class: "muted" }, `Measured against ${name}; mean of ${found.frames.length} frames, relative to the white level ${figure(found.peak)}.`),
-      h("details", null, h("summary", null, "Frame by frame"), facts(found.frames.map((frame) => [`Frame ${frame.frame}`, `${frame.psnr === null ? "∞" : `${figure(frame.psnr, 3)} dB`}${frame.ssim === null ? "" : `, SSIM ${figure(frame.ssim, 3)}`}`]))));
+    const decibels = found.frames.map((frame) => frame.psnr ?? Infinity);
+    const rows = found.frames.map((frame) => [frame.frame, frame.psnr ?? "inf", frame.ssim ?? ""]);
+    put(this.measured, h("p", { class: "quality" }, h("b", null, found.psnr === null ? "∞" : `${figure(found.psnr, 3)} dB`), " PSNR measured", found.ssim !== null && [", ", h("b", null, figure(found.ssim, 3)), " SSIM"]),
+      h("p", { class: "muted" }, `Against the true frames of this job; mean of ${found.frames.length} frames, relative to the white level ${figure(found.peak)}.`),
+      h("details", { open: true }, h("summary", null, "PSNR frame by frame"),
+        decibels.length > 1 && decibels.every(Number.isFinite) && plot(decibels, { xName: "frame", yName: "PSNR in dB", first: 1, width: 270 }),
+        h("div", { class: "row" }, csvLink(`${this.job.id.slice(-8)}_${this.snapshot}_quality.csv`, ["frame", "psnr_db", "ssim"], rows))));
     return true;
   }
 }
-
-/** Verdicts on an expected PSNR without findings, by grade. */
-const EXPECTED = {
-  good: ["Likely good", "good", "Measurement and calibration fit each other. Frames like these are close to the scene."],
-  usable: ["Likely usable", "usable", "Measurement and calibration fit each other. Frames like these lack texture."],
-  bad: ["Likely poor", "bad", "Measurement and calibration fit each other, but frames like these show only coarse shapes correctly."],
-};
 
 /** Verdicts on a measured PSNR, with their lower limits in dB in descending order. */
 const LEVELS = [
   ["Excellent", "good", "35 dB or more: errors are hard to see.", 35],
   ["Good", "good", "28 to 35 dB: expect softened detail.", 28],
   ["Usable", "usable", "22 to 28 dB: expect lost texture.", 22],
-  ["Poor", "bad", "Less than 22 dB: expect only coarse shapes.", -Infinity],
+  ["Bad", "bad", "Less than 22 dB: expect only coarse shapes.", -Infinity],
 ];

@@ -2,6 +2,8 @@
 
 /** Largest zoom in pane pixels per image pixel. */
 const MAX_ZOOM = 64;
+/** Largest movement of a click in pixels. */
+const CLICK = 4;
 
 /** Position (the image pixel in the middle of a pane) and zoom (pane pixels per image pixel). */
 export class View {
@@ -62,13 +64,22 @@ export function steer(canvas, view, pane, signal) {
       y: view.y + (event.clientY - box.top - box.height / 2) / zoom,
     };
   };
+  // `pressed` is the event of the last press, `drawing` the start of a line or rectangle that a tool draws.
+  let [pressed, drawing] = [null, null];
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, event);
+    pressed = pointers.size === 1 && event.button === 0 ? event : null;
+    drawing = pressed && event.pointerType !== "touch" && pane.tool?.draws() ? place(event) : null;
   }, { signal });
+  canvas.addEventListener("pointerleave", () => pane.hover(null), { signal });
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
-    if (!before) return;
+    if (!before || drawing) {
+      pane.hover(place(event));
+      if (drawing) pane.tool.draw(drawing, place(event), false);
+      return;
+    }
     const { zoom } = pane.place();
     if (idle()) {
       // The browser scrolls the page.
@@ -83,8 +94,18 @@ export function steer(canvas, view, pane, signal) {
     }
     pointers.set(event.pointerId, event);
   }, { signal });
+  canvas.addEventListener("pointerup", (event) => {
+    if (drawing) pane.tool.draw(drawing, place(event), true);
+    else if (pressed && Math.hypot(event.clientX - pressed.clientX, event.clientY - pressed.clientY) < CLICK) {
+      pane.hover(place(event));
+      pane.tool?.click(place(event));
+    }
+  }, { signal });
   for (const kind of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId), { signal });
+    canvas.addEventListener(kind, (event) => {
+      pointers.delete(event.pointerId);
+      drawing = pressed = null;
+    }, { signal });
   }
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();

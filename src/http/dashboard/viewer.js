@@ -6,7 +6,10 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
+import { figure, frameName } from "./format.js";
 import { get, isUnreachable } from "./api.js";
+import { Probe } from "./probe.js";
+import { sampled } from "./values.js";
 
 const MODES = [["frame", "Frames"], ["difference", "Difference from the previous frame"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
 
@@ -19,7 +22,7 @@ export class Viewer {
     this.left = new Pane("Measurement", this.view, signal);
     this.leftContrast = new Contrast("measurement", () => this.showLeft());
     this.rightContrast = new Contrast("frames", () => this.showRight());
-    this.player = new Player(frames, signal, () => this.showRight());
+    this.player = new Player(frames, signal, () => this.showRight(), job.dispersion ? (frame) => frameName(job, frame) : undefined);
     this.player.ahead = (frame) => this.mode() === "residual" || this.right.prepare(this.source(frame), ...this.rightContrast.window());
     // With this box checked, playback of a sequence continues with the next snapshot.
     this.through = h("input", { type: "checkbox", id: "through" });
@@ -36,9 +39,14 @@ export class Viewer {
     this.left.element.append(this.leftContrast.element);
     this.slicing = h("details", { class: "slicing" }, h("summary", null, "x–t slice"), this.slice.element);
     this.slicing.addEventListener("toggle", () => this.showRight());
-    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.slicing,
+    this.fullScale = 1;
+    const stack = () => ({ base: this.base(), height, width, version: this.right.generation });
+    const picture = () => this.ready && { ...stack(), base: this.source(this.player.frame).base };
+    this.probe = new Probe(this.right, frames, { picture, stack, frame: () => this.player.frame, unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
+    for (const pane of [this.left, this.right]) pane.describe = (value) => this.words(value);
+    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.probe.element, this.slicing,
       h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
-        h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.")));
+        h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows a pixel through time. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.")));
     this.measured = null;
     this.beside = h("section", { class: "card viewer beside", "aria-label": "Measurement" }, this.left.element);
     this.player.keys(this.element);
@@ -57,6 +65,24 @@ export class Viewer {
     if (!document.fullscreenEnabled) full.hidden = true;
     return [small("Zoom out", "−", () => this.nearer(1 / 1.5)), zoom, small("Zoom in", "+", () => this.nearer(1.5)),
       small("Fit the whole picture", "Fit", () => this.view.fit()), small("1 : 1, one screen pixel per image pixel", "1 : 1", () => this.nearer(null)), full];
+  }
+
+  /** Factor and words of the unit of values: the camera's counts, or multiples of a full scale of 1. */
+  unit() {
+    return { factor: this.fullScale, words: this.fullScale === 1 ? "× full scale" : "counts" };
+  }
+
+  /** A value in the user's units. */
+  words(value) {
+    const { factor, words } = this.unit();
+    return `${value.map((one) => figure(one * factor, 4)).join(", ")} ${words}`;
+  }
+
+  /** Sets the stored number that means 1. */
+  setFullScale(scale) {
+    this.fullScale = scale;
+    for (const contrast of [this.leftContrast, this.rightContrast]) contrast.measure(this.unit());
+    this.probe.renew();
   }
 
   mode() {
@@ -86,7 +112,8 @@ export class Viewer {
 
   source(frame) {
     const name = this.name(frame);
-    const label = { frame: `Frame ${frame} of ${this.player.count}`, difference: `Difference of frame ${Math.max(2, frame)} from the previous one`, error: `Expected error of frame ${frame}`, residual: "Residual map" }[this.mode()];
+    const called = (number) => frameName(this.job, number);
+    const label = { frame: `${called(frame).replace(/^./, (letter) => letter.toUpperCase())} of ${this.player.count}`, difference: `Difference of ${called(Math.max(2, frame))} from the previous one`, error: `Expected error of ${called(frame)}`, residual: "Residual map" }[this.mode()];
     return { base: `${this.base()}/${name}`, levels: this.levels, tile: this.tile, label };
   }
 
@@ -110,6 +137,7 @@ export class Viewer {
       this.measured = { base, levels: spread.levels, tile: spread.tile, label: `Measurement, snapshot ${snapshot}` };
       this.left.setNote("");
       this.leftContrast.offer(spread);
+      this.distribute(this.leftContrast, base, spread, 0);
       this.showLeft();
     } catch (error) {
       // Show the job even if its measurement is damaged.
@@ -152,6 +180,7 @@ export class Viewer {
       const spread = await this.spread();
       Object.assign(this, { levels: spread.levels, tile: spread.tile });
       this.rightContrast.offer(spread);
+      this.distribute(this.rightContrast, `${this.base()}/${this.name(Math.ceil(this.player.count / 2))}`, spread, this.right.generation);
     } catch (error) {
       if (!error.errors || isUnreachable(error)) throw error;
       this.ready = false;
@@ -173,6 +202,15 @@ export class Viewer {
     return this.spreads.get(name);
   }
 
+  /** Draws the histogram of a picture. */
+  async distribute(contrast, base, { height, width }, version) {
+    try {
+      contrast.distribution(await sampled({ base, height, width, version }));
+    } catch {
+      // The contrast works without its histogram.
+    }
+  }
+
   showLeft() {
     this.left.show(this.measured, ...this.leftContrast.window());
   }
@@ -183,5 +221,6 @@ export class Viewer {
     if (this.mode() === "frame") this.frameWindow = this.rightContrast.window();
     this.right.show(this.source(this.player.frame), ...this.rightContrast.window());
     this.slice.show(this.player.frame);
+    if (this.probe.kind === "line") this.probe.renew();
   }
 }

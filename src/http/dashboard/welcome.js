@@ -1,7 +1,6 @@
 // The first screen: purpose, three steps, and a job with sample data.
 
 import { announce, h, put } from "./dom.js";
-import { keepTruth } from "./storage.js";
 import { send } from "./api.js";
 import { WHAT } from "./signin.js";
 
@@ -10,6 +9,22 @@ const STEPS = [
   ["Measure", "Upload one or more coded images. Each is checked against its calibration before the computation starts."],
   ["Reconstruct", "Watch the frames appear, judge them, and download EXR stacks or arrays with a record of how they were made."],
 ];
+
+/**
+ * The sample's coded image, and the frames that the default algorithm reconstructs from it. `sample.webp` has them side by
+ * side: pictures of the measurement and of the eight frames, 160 pixels wide.
+ */
+function example() {
+  const clip = h("div", { class: "clip", role: "img", "aria-label": "The eight frames of the result, playing" });
+  const again = h("button", { type: "button", class: "small" }, "Play again");
+  const box = h("div", null, clip);
+  // A new element starts the animation again.
+  again.addEventListener("click", () => put(box, clip.cloneNode()));
+  return h("div", { class: "example" },
+    h("figure", null, h("div", { class: "coded", role: "img", "aria-label": "The coded image of the sample" }), h("figcaption", null, "One coded image")),
+    h("span", { class: "arrow", "aria-hidden": "true" }, "→"),
+    h("figure", null, box, h("figcaption", null, "8 frames", again)));
+}
 
 /** The introduction for new users. */
 export function welcome() {
@@ -20,7 +35,6 @@ export function welcome() {
     put(status, h("p", { class: "muted" }, "Coding a clip of 8 frames into one image …"));
     try {
       const made = await send("POST", "/v1/samples", { label: "sample", ...request });
-      keepTruth(made.job.id, { sha256: made.truth, name: "the original clip" });
       announce("Sample submitted");
       location.hash = `#/jobs/${made.job.id}`;
     } catch (error) {
@@ -33,9 +47,10 @@ export function welcome() {
   button.addEventListener("click", () => submit({}));
   return h("section", { class: "welcome", "aria-label": "Welcome" },
     h("h1", null, "One image in, 6 to 30 frames out"), h("p", { class: "lead" }, WHAT),
-    h("ol", { class: "threesteps" }, STEPS.map(([title, text]) => h("li", null, h("h2", null, title), h("p", null, text)))),
-    h("div", { class: "row" }, button, h("a", { class: "button large writes", href: "#/new" }, "Use my own files")), status,
-    h("p", { class: "muted" }, "The sample is a real clip, coded by a simulated camera. Its true frames are known, so the quality of the result can be measured."));
+    h("div", { class: "intro" }, example(), h("div", null,
+      h("div", { class: "row" }, button, h("a", { class: "button large writes", href: "#/new" }, "Use my own files")), status,
+      h("p", { class: "muted" }, "The sample is a real clip, coded by a simulated camera. Its true frames are known, so the quality of the result can be measured."))),
+    h("ol", { class: "threesteps" }, STEPS.map(([title, text]) => h("li", null, h("h2", null, title), h("p", null, text)))));
 }
 
 export async function start(root) {

@@ -19,7 +19,7 @@ use super::composed::{Composed, Content, Part, Section, Source};
 use super::format::Format;
 use engine::job::JobId;
 use engine::pipeline::manifest::CameraRecord;
-use formats::{Channels, bigtiff, npy};
+use formats::{Channels, clip_tiff, npy};
 use store::Job;
 
 const ARRAY: &str = "frames.npy";
@@ -58,16 +58,20 @@ impl FromRequestParts<App> for Clip {
     }
 }
 
-/// `tiff`: a BigTIFF with OME-XML and an ImageJ description.
+/// `tiff`: an OME-TIFF; a BigTIFF if it is larger than 4 GiB.
 pub(super) async fn tiff(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let times = clip.times().await?;
     let name = clip.snapshot.map_or(String::new(), |snapshot| format!(" snapshot {snapshot}"));
-    let head = bigtiff::head(&bigtiff::Clip {
+    let head = clip_tiff::head(&clip_tiff::Clip {
         name: &format!("{}{name}", clip.job.id),
         shape: clip.shape(),
         channels: clip.channels(),
         interval_s: times.interval_s,
         times_s: times.starts_s.as_deref(),
+        bands: clip.job.spec.dispersion.as_ref().map(|dispersion| clip_tiff::Bands {
+            count: dispersion.bands(),
+            wavelengths_nm: dispersion.wavelengths.as_deref(),
+        }),
     });
     clip.send_with_head(head, "image/tiff", "stack.tif", request).await
 }
@@ -115,7 +119,7 @@ impl Clip {
 
     /// Numbers of frames, rows and columns.
     fn shape(&self) -> (usize, usize, usize) {
-        let shape = self.job.spec.shape;
+        let shape = self.job.spec.frame_shape();
         (self.snapshots().len() * shape.frames, shape.height, shape.width)
     }
 
@@ -124,7 +128,7 @@ impl Clip {
     }
 
     fn frame_bytes(&self) -> u64 {
-        let shape = self.job.spec.shape;
+        let shape = self.job.spec.frame_shape();
         (shape.height * shape.width * self.channels().count() * size_of::<f32>()) as u64
     }
 
@@ -172,7 +176,10 @@ impl Clip {
         // Readers take a missing chunk for zeros, so the metadata exist only once all chunks do.
         self.sources().await?;
         let interval_s = self.times().await?.interval_s;
-        let mut time = json!({ "name": "t", "type": "time" });
+        let mut time = match self.job.spec.dispersion {
+            Some(_) => json!({ "name": "c", "type": "channel" }),
+            None => json!({ "name": "t", "type": "time" }),
+        };
         if interval_s.is_some() {
             time["unit"] = "second".into();
         }
@@ -210,7 +217,11 @@ impl Clip {
         let times = self.times().await?;
         let bytes = json!({ "name": "bytes", "configuration": { "endian": "little" } });
         let (shape, names, codecs) = match self.channels() {
-            Channels::Grey => (vec![frames, height, width], &["t", "y", "x"][..], vec![bytes]),
+            Channels::Grey => {
+                let bands = self.job.spec.dispersion.is_some();
+                let names = if bands { &["c", "y", "x"] } else { &["t", "y", "x"] };
+                (vec![frames, height, width], &names[..], vec![bytes])
+            }
             channels @ Channels::Rgb => {
                 // The stored frames are [row, column, colour]; NGFF wants channels before space.
                 let transpose =
@@ -237,6 +248,7 @@ impl Clip {
                 "job": self.job.id,
                 "frame_interval_s": times.interval_s,
                 "frame_times_s": times.starts_s,
+                "dispersion": self.job.spec.dispersion,
             },
         }))
     }
@@ -289,6 +301,10 @@ impl Clip {
     async fn times(&self) -> Result<Times> {
         let measurement =
             self.app.store.measurement(&self.job.lab, self.job.spec.measurement).await?;
+        if self.job.spec.dispersion.is_some() {
+            // All bands are exposed at the same time.
+            return Ok(Times { interval_s: None, starts_s: None });
+        }
         let camera = (measurement.facts.camera_fps, measurement.facts.exposure_s);
         let frames = self.job.spec.shape.frames;
         let records: Option<Vec<CameraRecord>> = self

@@ -34,7 +34,7 @@ async fn parts(clip: &Clip) -> Result<Vec<Part>> {
     let errors = Source { snapshot, file };
     let (file, _, stored) = clip.app.store.open_result(&clip.job, snapshot, STACK).await?;
     let stack = Source { snapshot, file };
-    let shape = clip.job.spec.shape;
+    let shape = clip.job.spec.frame_shape();
     let (frames, height, width) = (shape.frames, shape.height, shape.width);
     let mut layered = read_layout(stored, shape).await?;
     let head = Bytes::from(std::mem::take(&mut layered.head));

@@ -12,7 +12,7 @@ pub(in crate::http) enum Format {
     Exr,
     /// All frames as one array.
     Npy,
-    /// A BigTIFF with a page per frame.
+    /// An OME-TIFF with a page per frame.
     Tiff,
     /// An OME-Zarr group, which is a directory of files.
     Zarr,

@@ -118,9 +118,10 @@ pub(super) async fn movie(
 /// Errors: 404 if a side of the movie would be too short, or if the frames do not exist yet.
 async fn check(clip: &Clip, format: MovieFormat) -> Result<()> {
     if !clip.job.spec.has_movie(format) {
+        let shape = clip.job.spec.frame_shape();
         let detail = format!(
             "frames of {}x{} have no MP4, because a side would be below {MIN_MOVIE_SIDE} pixels; they have a GIF",
-            clip.job.spec.shape.height, clip.job.spec.shape.width
+            shape.height, shape.width
         );
         return Err(ApiError::new(Code::NotFound, detail));
     }

@@ -96,22 +96,13 @@ pub(super) async fn preview<N: Named>(
 pub(super) async fn tile<N: Named>(
     Caller(app, access): Caller,
     Params(name): Params<N>,
-    Params(TilePath { level, row, column }): Params<TilePath>,
+    Params(at): Params<TilePath>,
     QueryOf(query): QueryOf<TileQuery>,
     headers: HeaderMap,
 ) -> Result<Response> {
     let picture = name.find(&app, &access.lab).await?;
     let window = display_window(query.black, query.white)?;
-    let region = picture.tile(level, row, column).ok_or_else(|| {
-        let detail = format!(
-            "there is no tile {level}/{row}/{column} of {}x{} pixels (rows x columns); tiles have \
-             {TILE} pixels a side, levels are 0 to {}",
-            picture.height,
-            picture.width,
-            picture.level_within(TILE)
-        );
-        ApiError::new(Code::NotFound, detail)
-    })?;
+    let region = tile_region(&picture, &at)?;
     draw(&app, picture, region, Some(window), &headers).await
 }
 
@@ -130,6 +121,44 @@ pub(super) async fn spread<N: Named>(
     let (low, high) = white.map_or((low, high), |white| (0.0, white));
     let body = SpreadBody { height, width, tile: TILE, levels, minimum, maximum, low, high };
     conditional::json(&body, &headers)
+}
+
+/// The values of a tile: float32, little-endian, by rows; three colours per pixel behind a mosaic.
+pub(super) async fn values<N: Named>(
+    Caller(app, access): Caller,
+    Params(name): Params<N>,
+    Params(at): Params<TilePath>,
+    headers: HeaderMap,
+) -> Result<Response> {
+    let picture = name.find(&app, &access.lab).await?;
+    let region = tile_region(&picture, &at)?;
+    let etag = conditional::etag(&Sha256::of(
+        format!("values/1 {} {region:?}", picture.identity).as_bytes(),
+    ));
+    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "private, no-cache".into())];
+    conditional::check_match(&headers, &etag)?;
+    if conditional::is_known(&headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
+    }
+    let values = app.pictures.reduced(Arc::new(picture), region).await?;
+    let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+    Ok((tags, [(header::CONTENT_TYPE, "application/octet-stream")], bytes).into_response())
+}
+
+/// The region of a tile.
+///
+/// Errors: 404 if the picture has no such tile.
+fn tile_region(picture: &Picture, &TilePath { level, row, column }: &TilePath) -> Result<Region> {
+    picture.tile(level, row, column).ok_or_else(|| {
+        let detail = format!(
+            "there is no tile {level}/{row}/{column} of {}x{} pixels (rows x columns); tiles have \
+             {TILE} pixels a side, levels are 0 to {}",
+            picture.height,
+            picture.width,
+            picture.level_within(TILE)
+        );
+        ApiError::new(Code::NotFound, detail)
+    })
 }
 
 fn display_window(black: f32, white: f32) -> Result<DisplayWindow> {

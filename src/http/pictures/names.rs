@@ -5,7 +5,9 @@ use std::sync::Arc;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
-use super::source::{Files, FinishedTile, Stack, Unfinished, expected_error, uploaded_frame};
+use super::source::{
+    Dispersed, Files, FinishedTile, Stack, Unfinished, expected_error, uploaded_frame,
+};
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::extract::canonical_number;
@@ -146,7 +148,7 @@ impl Named for OfJob {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let Self { job, snapshot, picture } = self;
         let job = with_snapshot(app, lab, job, snapshot).await?;
-        let (frames, height) = (job.spec.shape.frames, job.spec.shape.height);
+        let SceneShape { frames, height, .. } = job.spec.frame_shape();
         if let JobPicture::Error(k) = picture
             && (1..=frames).contains(&k)
         {
@@ -234,14 +236,20 @@ async fn snapshots_stack(app: &App, measurement: &Measurement) -> Result<Stack> 
 
 async fn prepared_stack(app: &App, sha256: Sha256, shape: (usize, usize, usize)) -> Result<Stack> {
     let files = Files::Prepared(app.store.intact_blob(sha256).await?);
-    Ok(Stack { shape, identity: sha256.to_string(), files, mosaic: None, white: None })
+    let identity = sha256.to_string();
+    Ok(Stack { shape, identity, files, mosaic: None, dispersion: None, white: None })
 }
 
 /// The frames of a snapshot. Before they are assembled, the finished tiles are shown on top of the preview. The hashes of
 /// these files are not checked here, but when the frames are assembled.
 async fn frames_stack(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let spec = &job.spec;
-    let shape = (spec.shape.frames, spec.shape.height, spec.shape.width);
+    let SceneShape { frames, height, width, .. } = spec.frame_shape();
+    let shape = (frames, height, width);
+    let dispersion = || {
+        let bands = spec.dispersion.clone()?;
+        Some(Arc::new(Dispersed { bands, sensor: (spec.shape.height, spec.shape.width) }))
+    };
     match app.store.open_result(job, Some(snapshot), "frames.npy").await {
         Ok((file, path, _)) => {
             return Ok(Stack {
@@ -249,6 +257,7 @@ async fn frames_stack(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
                 identity: file.sha256.to_string(),
                 files: Files::Frames(path),
                 mosaic: spec.shape.mosaic,
+                dispersion: dispersion(),
                 white: white_level(app, job.id).await?,
             });
         }
@@ -284,12 +293,13 @@ async fn frames_stack(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     let unfinished = Unfinished { preview: preview.map(|(_, path)| path), tiles };
     let identity = Sha256::of(hashes.as_bytes()).to_string();
     let files = Files::Tiles(Arc::new(unfinished));
-    Ok(Stack { shape, identity, files, mosaic: spec.shape.mosaic, white: None })
+    let (mosaic, dispersion) = (spec.shape.mosaic, dispersion());
+    Ok(Stack { shape, identity, files, mosaic, dispersion, white: None })
 }
 
 /// A picture of the expected error of frame `k`, from 0.
 async fn error_picture(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<Picture> {
-    let SceneShape { height, width, .. } = job.spec.shape;
+    let SceneShape { height, width, .. } = job.spec.frame_shape();
     // Reports the reason if the file does not exist.
     result_file(app, job, Some(snapshot), "error.npy").await?;
     let (file, path, _) = app.store.open_result(job, Some(snapshot), "error.npy").await?;

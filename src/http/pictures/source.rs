@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use ndarray::{Array2, Array3, Axis, s};
 
 use crate::http::rendering::Picture;
-use engine::job::{MARGIN, Mosaic, Sha256};
+use engine::job::{Dispersion, MARGIN, Mosaic, Sha256};
 use engine::pipeline::assessment::BLOCK;
 use formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
 
@@ -22,8 +22,18 @@ pub(super) struct Stack {
     pub(super) files: Files,
     /// The mosaic of a colour sensor, for frames. Result files are demosaicked; tiles and previews are not.
     pub(super) mosaic: Option<Mosaic>,
+    /// The displacement of the bands of a spectral camera, for frames. Result files are in place; tiles and previews are as
+    /// on the sensor.
+    pub(super) dispersion: Option<Arc<Dispersed>>,
     /// The white level of a job's frames; `None` before it is known, and for other stacks.
     pub(super) white: Option<f32>,
+}
+
+/// The displacement of bands, and the rows and columns of the sensor.
+#[derive(Debug)]
+pub(super) struct Dispersed {
+    pub(super) bands: Dispersion,
+    pub(super) sensor: (usize, usize),
 }
 
 #[derive(Debug, Clone)]
@@ -62,6 +72,14 @@ type Window = Result<Array3<f32>, FormatError>;
 impl Stack {
     /// The frames for display: \[frames, rows, columns\], or \[frames, rows, 3 columns\] for colours.
     fn window(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
+        if let (Some(dispersed), Files::Tiles(_)) = (&self.dispersion, &self.files) {
+            return each_band(frames, (rows.len(), columns.len()), |band| {
+                let place = (rows.clone(), columns.clone());
+                let (rows, columns) = dispersed.bands.sensor_window(band, place);
+                let sensor = first_frame(self.stored(band..band + 1, rows, columns)?);
+                Ok(dispersed.bands.interpolate(sensor.view(), band))
+            });
+        }
         match (self.mosaic, &self.files) {
             (None, _) => self.stored(frames, rows, columns),
             (Some(_), Files::Frames(_)) => {
@@ -89,8 +107,18 @@ impl Stack {
         }
     }
 
-    /// The frames as the sensor records them, one colour for each pixel: \[frames, rows, columns\].
+    /// The frames as the sensor records them, one colour for each pixel, or each band where it arrives: \[frames, rows,
+    /// columns\].
     fn raw(&self, frames: Range<usize>, rows: Range<usize>, columns: Range<usize>) -> Window {
+        if let (Some(dispersed), Files::Frames(_)) = (&self.dispersion, &self.files) {
+            let (_, height, width) = self.shape;
+            return each_band(frames, (rows.len(), columns.len()), |band| {
+                let place = (rows.clone(), columns.clone());
+                dispersed.bands.sheared_window(band, (height, width), place, |rows, columns| {
+                    Ok(first_frame(self.stored(band..band + 1, rows, columns)?))
+                })
+            });
+        }
         let (Some(mosaic), Files::Frames(_)) = (self.mosaic, &self.files) else {
             return self.stored(frames, rows, columns);
         };
@@ -205,6 +233,7 @@ impl Stack {
     pub(super) fn residual(&self, masks: &Self, measurement: &Self, snapshot: usize) -> Picture {
         let frames = self.shape.0;
         let name = format!("{} {} {snapshot} residual", masks.identity, measurement.identity);
+        let measured = measurement.shape;
         let (masks, measurement) = (masks.clone(), measurement.clone());
         let picture = self.picture(&name, 2 * frames, move |stack, rows, columns| {
             let y = measurement.window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
@@ -217,8 +246,22 @@ impl Stack {
             residual.mapv_inplace(f32::abs);
             Ok(residual)
         });
-        Picture { channels: Channels::Grey, ..picture }
+        let (_, height, width) = measured;
+        Picture { channels: Channels::Grey, height, width, ..picture }
     }
+}
+
+/// Reads frames one by one and stacks them.
+fn each_band(
+    bands: Range<usize>,
+    (height, width): (usize, usize),
+    read: impl Fn(usize) -> Result<Array2<f32>, FormatError>,
+) -> Window {
+    let mut stack = Array3::zeros((bands.len(), height, width));
+    for (band, mut frame) in bands.zip(stack.outer_iter_mut()) {
+        frame.assign(&read(band)?);
+    }
+    Ok(stack)
 }
 
 /// A frame of an uploaded file, counted from 1. Most formats can only be read from the beginning, so the frame is read once
@@ -302,6 +345,7 @@ fn enlarge_preview(
     columns: &Range<usize>,
 ) -> Window {
     let (_, height, width) = stack.shape;
+    let (height, width) = stack.dispersion.as_ref().map_or((height, width), |one| one.sensor);
     let step = if stack.mosaic.is_some() { 2 } else { 1 };
     let coarse_index = |index: usize, length: usize, coarse_length: usize| {
         index / step * (coarse_length / step) / (length / step) * step + index % step
@@ -359,9 +403,10 @@ fn overlay_tiles(
 mod tests {
     use std::sync::Arc;
 
-    use super::{Files, FinishedTile, Mosaic, Stack, Unfinished};
+    use super::{Dispersed, Dispersion, Files, FinishedTile, Mosaic, Stack, Unfinished};
+    use engine::job::{DispersionAxis, MaskExtent};
     use formats::{npy, planar};
-    use ndarray::{Array3, s};
+    use ndarray::{Array3, Axis, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
         let (frames, height, width) = stack.dim();
@@ -374,7 +419,50 @@ mod tests {
     }
 
     fn stack(shape: (usize, usize, usize), files: Files) -> Stack {
-        Stack { shape, identity: "x".into(), files, mosaic: None, white: None }
+        Stack { shape, identity: "x".into(), files, mosaic: None, dispersion: None, white: None }
+    }
+
+    #[test]
+    fn bands_are_shown_in_their_place_before_and_after_their_assembly() {
+        let folder = tempfile::tempdir().unwrap();
+        let bands = Dispersion {
+            axis: DispersionAxis::Column,
+            offsets: vec![0.0, 2.0, 3.5],
+            wavelengths: None,
+            mask: MaskExtent::Scene,
+        };
+        let cube =
+            Array3::from_shape_fn((3, 10, 12), |(k, i, j)| (k * 7 + i * 3 + j) as f32 / 40.0);
+        let mut sensor = Array3::zeros((3, 10, 16));
+        for (k, frame) in cube.outer_iter().enumerate() {
+            sensor.index_axis_mut(Axis(0), k).assign(&bands.shear(frame, k));
+        }
+        let dispersed = |files| {
+            let dispersed = Dispersed { bands: bands.clone(), sensor: (10, 16) };
+            Stack { dispersion: Some(Arc::new(dispersed)), ..stack((3, 10, 12), files) }
+        };
+        let preview = Some(prepared(folder.path(), "preview", &sensor));
+        let before = dispersed(Files::Tiles(Arc::new(Unfinished { preview, tiles: Vec::new() })));
+        let path = folder.path().join("frames.npy");
+        npy::write_f32(&path, cube.view()).unwrap();
+        let after = dispersed(Files::Frames(path));
+        for (k, frame) in cube.outer_iter().enumerate() {
+            let shown = |stack: &Stack| {
+                let picture = stack.frame(k);
+                picture.reduce(&picture.whole(0)).unwrap()
+            };
+            assert_eq!(shown(&after), frame);
+            assert_eq!(shown(&before), bands.unshear(sensor.index_axis(Axis(0), k), k));
+        }
+        // The residual lies on the sensor.
+        let y = sensor.sum_axis(Axis(0)).insert_axis(Axis(0));
+        let measurement = stack((1, 10, 16), Files::Prepared(prepared(folder.path(), "y", &y)));
+        let open = Array3::ones((3, 10, 16));
+        let masks = stack((3, 10, 16), Files::Prepared(prepared(folder.path(), "masks", &open)));
+        let picture = after.residual(&masks, &measurement, 0);
+        let residual = picture.reduce(&picture.whole(0)).unwrap();
+        assert_eq!(residual.dim(), (10, 16));
+        assert!(residual.iter().all(|value| *value < 1e-5), "{residual}");
     }
 
     #[test]

@@ -11,7 +11,10 @@ use crate::http::admission::Reservation;
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
 use crate::http::upload::{CHUNKS, Pace, next};
-use store::{PartialFile, Store, StoreError};
+use store::{Partial, PartialFile, Store, StoreError};
+
+/// Bytes of a piece with a checksum between two checks of the quotas. Other pieces are checked as they are recorded.
+const CHECKED_BYTES: u64 = 16 << 20;
 
 /// Bytes and time after which the offset is recorded: a crash of the service costs at most these.
 const RECORDED_BYTES: u64 = 16 << 20;
@@ -28,8 +31,7 @@ pub(super) async fn append(
     body: Body,
 ) -> Result<PartialFile> {
     let has_checksum = checksum.is_some();
-    let length = file.upload().facts.length;
-    let remaining = length - file.upload().received;
+    let upload = file.upload().clone();
     let (sender, receiver) = mpsc::channel(CHUNKS);
     let progress = Progress {
         store: app.store.clone(),
@@ -40,7 +42,7 @@ pub(super) async fn append(
         None => write(file, receiver, &progress),
         Some(checksum) => write_checked(file, receiver, checksum),
     });
-    let transfer = forward_chunks(app, &mut room, length, remaining, body, sender);
+    let transfer = forward_chunks(app, &mut room, &upload, has_checksum, body, sender);
     let transfer = match has_checksum {
         // A part of the piece would not be kept, so it has the time of other requests to end.
         true => transfer.await,
@@ -67,21 +69,37 @@ pub(super) async fn append(
     transfer.map(|()| written.file)
 }
 
-/// Passes the chunks of the body to the writer. `remaining` is the number of bytes that the upload still needs.
+/// Passes the chunks of the body to the writer.
 ///
-/// Errors: 413 if the body is longer.
+/// Errors: 413 if the body is longer than the rest of the upload; 403 if an upload of unknown length exceeds a quota.
 async fn forward_chunks(
     app: &App,
     room: &mut Reservation,
-    length: u64,
-    mut remaining: u64,
+    upload: &Partial,
+    has_checksum: bool,
     body: Body,
     sender: mpsc::Sender<Bytes>,
 ) -> Result<()> {
+    let facts = &upload.facts;
     let mut stream = body.into_data_stream();
     let mut pace = Pace::default();
+    let (mut bytes, mut next_check) = (0, 0);
     while let Some(chunk) = next(app, &mut pace, &mut stream).await? {
-        remaining = remaining.checked_sub(chunk.len() as u64).ok_or_else(|| beyond_end(length))?;
+        bytes += chunk.len() as u64;
+        match facts.length {
+            Some(length) if bytes > length - upload.received => {
+                return Err(beyond_end(length));
+            }
+            Some(_) => {}
+            None => {
+                app.admission.check_size(upload.received + bytes)?;
+                // The store decides in the end. This check ends a body early that can't be accepted.
+                if has_checksum && bytes > next_check {
+                    app.store.check_quota(&facts.lab, facts.token, bytes).await?;
+                    next_check = bytes + CHECKED_BYTES;
+                }
+            }
+        }
         app.admission.take(room, chunk.len() as u64).await?;
         // A closed channel means that the writer failed. The caller reports the writer's error.
         if sender.send(chunk).await.is_err() {
@@ -105,7 +123,7 @@ pub(super) async fn expect_no_bytes(app: &App, length: u64, body: Body) -> Resul
 }
 
 fn beyond_end(length: u64) -> ApiError {
-    let detail = format!("the upload was created with {length} bytes; the body is longer");
+    let detail = format!("the upload has {length} bytes; the body is longer");
     ApiError::new(Code::TooLarge, detail)
 }
 

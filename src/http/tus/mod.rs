@@ -1,4 +1,4 @@
-//! `/v1/uploads`: resumable uploads by tus 1.0 (core, creation, checksum, expiration, termination).
+//! `/v1/uploads`: resumable uploads by tus 1.0 (core, creation, deferred length, checksum, expiration, termination).
 //!
 //! The crate `tus-protocol` 0.1 leaves storage, state, locks and hooks to its caller, and these are most of the code
 //! below. The protocol alone is four handlers, so the crate is not used.
@@ -26,10 +26,13 @@ use store::{FIRST_RESERVE, FoundPartial, Made, NewPartial, Partial, PartialFile}
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
+const DEFER_LENGTH: HeaderName = HeaderName::from_static("upload-defer-length");
 const OFFSET: HeaderName = HeaderName::from_static("upload-offset");
 const METADATA: HeaderName = HeaderName::from_static("upload-metadata");
 const CHECKSUM: HeaderName = HeaderName::from_static("upload-checksum");
 const EXPIRES: HeaderName = HeaderName::from_static("upload-expires");
+/// Supported extensions of the protocol.
+const EXTENSIONS: &str = "creation,creation-defer-length,checksum,expiration,termination";
 const VERSION: HeaderValue = HeaderValue::from_static("1.0.0");
 
 /// Rewrites a request by the rules of tus. `X-HTTP-Method-Override` replaces the method, for clients that can send only
@@ -79,8 +82,8 @@ pub(super) struct ListQuery {
 #[schemars(rename = "Upload")]
 pub(super) struct UploadBody {
     id: PartialId,
-    /// Bytes of the whole file.
-    length: u64,
+    /// Bytes of the whole file; null until the client states them.
+    length: Option<u64>,
     /// Bytes received so far.
     received: u64,
     /// `Upload-Metadata` as the client sent it.
@@ -122,7 +125,7 @@ pub(super) async fn list(
 pub(super) async fn options(State(app): State<App>) -> Response {
     let fields = [
         ("tus-version", "1.0.0".to_owned()),
-        ("tus-extension", "creation,checksum,expiration,termination".to_owned()),
+        ("tus-extension", EXTENSIONS.to_owned()),
         ("tus-checksum-algorithm", headers::ALGORITHMS.to_owned()),
         ("tus-max-size", app.settings.max_upload_bytes.to_string()),
     ];
@@ -135,30 +138,42 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
         let detail = "uploads are not concatenated: send the file as one upload (parallelUploads: 1 in tus-js-client)";
         return Err(malformed(detail.into()));
     }
-    if headers.contains_key("upload-defer-length") {
-        let detail = "an upload states its length when it is created: send Upload-Length in place of \
-                      Upload-Defer-Length";
-        return Err(malformed(detail.into()));
-    }
-    let length = number(&headers, &LENGTH)?;
-    if length == 0 {
-        return Err(ApiError::new(Code::EmptyBody, "the upload has no bytes"));
-    }
+    let length = announced_length(&headers)?;
     let metadata = text(&headers, &METADATA)?.unwrap_or_default();
     let expected = expected_sha256(metadata).map_err(malformed)?;
     let key = request_key(&headers, &(length, metadata))?;
     if let Some(id) = app.store.made_with(&access.lab, Made::Upload, key.as_ref()).await? {
         return created(&app, &access.lab, id).await;
     }
-    app.admission.check_length(&access, length).await?;
+    app.admission.check_length(&access, length.unwrap_or(1)).await?;
     let Access { lab, token, .. } = access;
     let facts =
         NewPartial { lab: lab.clone(), token, length, metadata: metadata.to_owned(), expected };
     // The reservation is extended while the upload grows.
-    let first = length.min(FIRST_RESERVE);
+    let first = length.unwrap_or(FIRST_RESERVE).min(FIRST_RESERVE);
     let insert = app.store.begin_partial(facts, app.settings.upload_age(), key.as_ref());
     let inserted = app.admission.with_room(&lab, ("the upload", first), insert).await?;
     created(&app, &lab, inserted.id()).await
+}
+
+/// The length that a new upload states; `None` if a later piece states it.
+fn announced_length(headers: &HeaderMap) -> Result<Option<u64>> {
+    match text(headers, &DEFER_LENGTH)? {
+        None => stated_length(headers).map(Some),
+        Some("1") if !headers.contains_key(&LENGTH) => Ok(None),
+        Some(_) => {
+            let detail = "Upload-Defer-Length must be 1, and stands in place of Upload-Length";
+            Err(malformed(detail.into()))
+        }
+    }
+}
+
+/// `Upload-Length`, which is at least 1.
+fn stated_length(headers: &HeaderMap) -> Result<u64> {
+    match number(headers, &LENGTH)? {
+        0 => Err(ApiError::new(Code::EmptyBody, "the upload has no bytes")),
+        length => Ok(length),
+    }
 }
 
 /// The answer to a request that created an upload, with the address for its pieces. A repeated request with the same
@@ -188,8 +203,7 @@ pub(super) async fn show(
     // If the connection broke after the last byte, the upload is finished here. If the file is shorter than the offset,
     // opening it fails with an error for the client.
     if upload.result.is_none()
-        && (upload.received == upload.facts.length
-            || app.store.partial_bytes(id).await? < upload.received)
+        && (upload.is_complete() || app.store.partial_bytes(id).await? < upload.received)
     {
         upload = run_detached(async move {
             match app.store.open_partial(&access.lab, id).await? {
@@ -200,8 +214,11 @@ pub(super) async fn show(
         })
         .await?;
     }
-    let length = upload.facts.length.to_string();
-    let facts = [(LENGTH, length), (METADATA, upload.facts.metadata.clone())];
+    let length = match upload.facts.length {
+        Some(length) => (LENGTH, length.to_string()),
+        None => (DEFER_LENGTH, "1".to_owned()),
+    };
+    let facts = [length, (METADATA, upload.facts.metadata.clone())];
     let facts = facts.into_iter().filter(|(_, value)| !value.is_empty());
     let cache = [(header::CACHE_CONTROL, "no-store")];
     let etag = [(header::ETAG, conditional::etag_of(&UploadBody::from(upload.clone()))?)];
@@ -261,6 +278,7 @@ async fn receive_piece(
     }
     check_encoding(headers)?;
     let offset = number(headers, &OFFSET)?;
+    let stated = headers.contains_key(&LENGTH).then(|| stated_length(headers)).transpose()?;
     let checksum = text(headers, &CHECKSUM)?.map(headers::Checksum::parse).transpose();
     let mut checksum = checksum.map_err(malformed)?;
     if checksum.is_none() {
@@ -278,17 +296,39 @@ async fn receive_piece(
         );
         return Err(ApiError::new(Code::OffsetMismatch, detail));
     }
-    let Some(file) = file else {
-        append::expect_no_bytes(app, upload.facts.length, body).await?;
+    if let Some(stated) = stated {
+        check_length(&upload, stated)?;
+    }
+    let Some(mut file) = file else {
+        append::expect_no_bytes(app, upload.received, body).await?;
         return Ok(upload);
     };
+    if let (Some(stated), None) = (stated, upload.facts.length) {
+        app.admission.check_size(stated)?;
+        app.store.set_partial_length(&mut file, stated).await?;
+    }
     // Without Content-Length, space is reserved while the bytes arrive.
     let length = text(headers, &header::CONTENT_LENGTH)?.and_then(|text| text.parse().ok());
     let length: u64 = length.unwrap_or_default();
-    let length = length.min(upload.facts.length - upload.received);
+    let most = file.upload().facts.length.unwrap_or(app.settings.max_upload_bytes);
+    let length = length.min(most.saturating_sub(upload.received));
     let room = app.admission.reserve(&access.lab, length).await?;
     let file = append::append(app, file, room, checksum, body).await?;
     finish(app, file).await
+}
+
+/// Checks the length that a piece states: a known one can't change, and no received byte can be taken back.
+fn check_length(upload: &Partial, stated: u64) -> Result<()> {
+    let received = upload.received;
+    match upload.facts.length {
+        Some(length) if length != stated => Err(malformed(format!(
+            "Upload-Length is {stated}, but the upload has {length} bytes, which can't change"
+        ))),
+        None if stated < received => {
+            Err(malformed(format!("Upload-Length is {stated}, but {received} bytes were received")))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Stores the file if it is complete.

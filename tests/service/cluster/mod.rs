@@ -129,6 +129,33 @@ async fn a_job_on_remote_workers_gives_the_same_bytes() {
 }
 
 #[tokio::test]
+async fn moved_masks_give_the_same_bytes_on_remote_workers() {
+    fn moved(measurement: &str) -> Value {
+        let mut job = with_iterations(measurement, 50);
+        job["registration"] = json!({"shift": [0.5, -1.25]});
+        job
+    }
+    let Some(nats) = Nats::start(1) else { return };
+    let expected = alone(moved).await;
+    let unmoved = alone(|measurement| with_iterations(measurement, 50)).await;
+    assert_ne!(expected, unmoved);
+    let app = served(&nats, "5").await;
+    let _worker = worker(&nats, &[]);
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    // The second job finds the first one's windows of masks in the stream, the third one must not.
+    for (job, expected) in [
+        (moved(&measurement), &expected),
+        (moved(&measurement), &expected),
+        (with_iterations(&measurement, 50), &unmoved),
+    ] {
+        let id = app.submit(&job).await;
+        let ended = app.ended(&id).await;
+        assert_eq!(ended["state"], "succeeded", "{ended:#}");
+        assert_eq!(results(&app, &id).await, *expected);
+    }
+}
+
+#[tokio::test]
 async fn each_process_uses_only_the_settings_for_it() {
     let Some(nats) = Nats::start(1) else { return };
     // The server's environment has the address of NATS. Its local workers ignore it, and compute the tiles.

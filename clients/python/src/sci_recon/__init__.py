@@ -6,13 +6,15 @@
 """
 
 from ._client import Calibration, Client, Job, Measurement, Result
-from ._errors import ApiError, CalibrationFailed, JobFailed, SciReconError
+from ._errors import ApiError, CalibrationFailed, ConnectionWarning, FindingWarning, JobFailed, SciReconError
 
 __all__ = [
     "ApiError",
     "Calibration",
     "CalibrationFailed",
     "Client",
+    "ConnectionWarning",
+    "FindingWarning",
     "Job",
     "JobFailed",
     "Measurement",

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import inspect
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 from ._client import Client
-from ._watch import Watch, submitter
+from ._watch import FILES, Watch, submitter
 
 # Keywords of `Client.reconstruct` that are not options of the command.
 OTHERS = {"self", "masks", "measurement", "folder", "key"}
@@ -60,18 +61,23 @@ def options(arguments: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def main(line: list[str] | None = None) -> None:
+def main(line: list[str] | None = None) -> int:
+    """Returns the exit status: 1 if files failed, 3 if the checks found errors, as `sci-recon watch-folder` does."""
     arguments = parser().parse_args(line)
     with Client(arguments.url, arguments.token) as client:
         submit = submitter(client, arguments.masks, options(vars(arguments)))
         own = [arguments.masks, *(arguments.dark or [])]
-        files = arguments.file or ["frames.npy", "manifest.json"]
+        files = arguments.file or FILES
         watch = Watch(client, arguments.folder, submit, files=files, own=own, settle_seconds=arguments.settle_seconds)
         watch.run(arguments.once)
+    if watch.failed:
+        print(f"{watch.failed} files have failed; see their .failed.txt", file=sys.stderr)
+        return 1
+    return 3 if watch.doubtful else 0
 
 
 if __name__ == "__main__":
     try:
-        main()
+        sys.exit(main())
     except KeyboardInterrupt:
         pass

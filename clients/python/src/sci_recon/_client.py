@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _transfer as transfer
-from ._errors import ApiError, CalibrationFailed, JobFailed
+from ._errors import ApiError, CalibrationFailed, FindingWarning, JobFailed
 from ._transfer import Source
 
 Record = dict[str, Any]
@@ -30,6 +30,8 @@ Snapshots = Literal["all"] | int | tuple[int, int]
 ENDED = {"succeeded", "failed", "cancelled"}
 # Side of the blocks of error.npy in pixels.
 BLOCK = 16
+# Files that the service composes on demand, and their exports.
+EXPORTS = {"stack.tif": "tiff", "stack-sigma.exr": "exr?layers=sigma"}
 
 
 class Client:
@@ -86,6 +88,7 @@ class Client:
         masks_packing: str | None = None,
         masks_name: str | None = None,
         mosaic: str | None = None,
+        dispersion: Mapping[str, Any] | None = None,
         bad_pixels: Source | None = None,
         dark: Source | Sequence[Source] = (),
         saturation: int | None = None,
@@ -102,8 +105,11 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
+        registration: str | Mapping[str, Sequence[float]] | None = None,
         priority: int = 0,
+        truth: Source | None = None,
         label: str | None = None,
+        webhook: str | None = None,
         key: str | None = None,
         folder: str | os.PathLike[str] | None = None,
     ) -> Result:
@@ -114,7 +120,7 @@ class Client:
         the axes fit, state "row-column-frame", "column-row-frame" or "frame-column-row". A colour sensor has a `mosaic`:
         "rggb", "bggr", "grbg" or "gbrg". The average of the `dark` captures is subtracted. The other arguments are those
         of `calibrate`, `measure` and `submit`. The frames are saved in `folder`, by default a temporary folder that exists
-        as long as the result. Findings with severity "error" are issued as Python warnings, with their remedies.
+        as long as the result. Findings of the checks are issued as Python warnings (`FindingWarning`), with their remedies.
         """
         if isinstance(masks, Calibration):
             calibration = masks
@@ -128,6 +134,7 @@ class Client:
                 frames=masks_frames,
                 packing=masks_packing,
                 mosaic=mosaic,
+                dispersion=dispersion,
                 bad_pixels=bad_pixels,
                 name=masks_name,
             )
@@ -154,14 +161,15 @@ class Client:
             schedule=schedule,
             tile=tile,
             model=model,
+            registration=registration,
             priority=priority,
+            truth=truth,
             label=label,
+            webhook=webhook,
             key=key,
         ).wait()
-        for finding in job.findings:
-            if finding["severity"] == "error":
-                warnings.warn(describe(finding), stacklevel=2)
-        return job.result(folder)
+        job.warn(stacklevel=3)
+        return Result(job, folder)
 
     def calibrate(
         self,
@@ -174,10 +182,14 @@ class Client:
         frames: tuple[int, int] | None = None,
         packing: str | None = None,
         mosaic: str | None = None,
+        dispersion: Mapping[str, Any] | None = None,
         bad_pixels: Source | None = None,
         name: str | None = None,
     ) -> Calibration:
         """Creates a calibration from masks [B, H, W]. A colour sensor has a `mosaic`.
+
+        A spectral camera has one mask [H, W] and a `dispersion` with `axis` ("column" or "row"), `offsets` (pixels of each
+        band), optionally `wavelengths` (nm), and `mask`: "scene" if the mask has the size of a band, or "measurement".
 
         `array` is the name of the masks in a file of several arrays. `crop` selects a window with `row`, `column`, `height`
         and `width`. `frames` selects the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed"
@@ -191,6 +203,7 @@ class Client:
             "frames": frames,
             "packing": packing,
             "mosaic": mosaic,
+            "dispersion": dispersion,
             "name": name,
             "bad_pixels": None if bad_pixels is None else self.upload(bad_pixels),
         }
@@ -279,14 +292,20 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
+        registration: str | Mapping[str, Sequence[float]] | None = None,
         priority: int = 0,
+        truth: Source | None = None,
         label: str | None = None,
+        webhook: str | None = None,
         key: str | None = None,
     ) -> Job:
         """Submits a job without waiting for it.
 
-        `snapshots` is "all", an index from 0, or (first, last), both included. A repeated request with the same `key`
-        returns the job of the first one.
+        `snapshots` is "all", an index from 0, or (first, last), both included. `registration` "auto", the default,
+        corrects masks that have moved since the calibration; {"shift": (rows, columns)} states the shift in pixels, and
+        "off" uses the calibrated masks. `truth` [B, H, W] has the true frames, if they are known: the dashboard shows PSNR
+        and SSIM against them. A repeated request with the same `key` returns the job of the first one. The service notifies
+        `webhook`, an address, when the job ends.
         """
         return Job(
             self,
@@ -300,8 +319,11 @@ class Client:
                 schedule=schedule,
                 tile=tile,
                 model=model,
+                registration=registration,
                 priority=priority,
+                truth=None if truth is None else self.upload(truth),
                 label=label,
+                webhook=webhook,
             ),
         )
 
@@ -397,7 +419,10 @@ class Calibration(Entity):
         return self
 
     def masks(self) -> npt.NDArray[np.float32]:
-        """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file."""
+        """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file.
+
+        A spectral camera has one mask for each band, as it lies on the sensor.
+        """
         record, name = self.record, self.record["masks"]
         with TemporaryDirectory(prefix="sci-recon-") as folder:
             path = Path(folder) / "masks.npy"
@@ -407,6 +432,8 @@ class Calibration(Entity):
                 if file.read(6) != b"\x93NUMPY":
                     raise ValueError(f"the masks are a {record['format']} file; read it, and pass the array")
             stored = np.load(path)
+        if record["dispersion"]:
+            stored = sheared(stored, record["dispersion"], (record["height"], record["width"]))
         order = (record["axes"] or "frame-row-column").split("-")
         stored = stored.transpose([order.index(axis) for axis in ("frame", "row", "column")])
         masks: npt.NDArray[np.float32] = np.maximum(stored / np.float64(record["full_scale"]), 0).astype(np.float32)
@@ -497,8 +524,17 @@ class Job(Entity):
         transfer.send(self.client.http, "DELETE", f"/v1/jobs/{self.id}")
 
     def result(self, folder: str | os.PathLike[str] | None = None) -> Result:
-        """The results of the job. Files are downloaded on first use into `folder`, by default a temporary folder."""
+        """The results of the job. Files are downloaded on first use into `folder`, by default a temporary folder.
+
+        The findings are issued as Python warnings (`FindingWarning`), with their remedies.
+        """
+        self.warn(stacklevel=3)
         return Result(self, folder)
+
+    def warn(self, stacklevel: int = 2) -> None:
+        """Issues the findings as Python warnings."""
+        for line in describe_all(self.findings):
+            warnings.warn(line, FindingWarning, stacklevel=stacklevel)
 
 
 class Result:
@@ -515,11 +551,14 @@ class Result:
         shape = self.job.record["shape"]
         frames = len(self.snapshots) * shape["frames"]
         name = self.job.record.get("label") or self.job.id
-        return f"<Result {name!r}: {self.job.verdict}; {frames} frames of {shape['height']}x{shape['width']}>"
+        codes = ", ".join(dict.fromkeys(f"{finding['severity']} {finding['code']}" for finding in self.job.findings))
+        found = f"; {codes}" if codes else ""
+        return f"<Result {name!r}: {self.job.verdict}{found}; {frames} frames of {shape['height']}x{shape['width']}>"
 
     def _repr_html_(self) -> str:
-        """HTML for Jupyter: name, verdict, and an animated preview if Pillow is installed."""
-        text = f"<p>{html.escape(repr(self))}</p>"
+        """HTML for Jupyter: name, verdict, findings, and an animated preview if Pillow is installed."""
+        findings = "".join(f"<li>{html.escape(line)}</li>" for line in describe_all(self.job.findings))
+        text = f"<p>{html.escape(repr(self))}</p>" + (f"<ul>{findings}</ul>" if findings else "")
         try:
             picture = preview(self.snapshot(self.snapshots[0]))
         except ImportError:
@@ -562,12 +601,14 @@ class Result:
         return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]
 
     def download(self, name: str, snapshot: int | None = None) -> Path:
-        """Downloads a file such as `stack.exr`, `frames.npy` or `frames/frame_0001.exr`, unless the folder has it."""
+        """Downloads a file such as `stack.exr`, `stack.tif`, `frames.npy` or `frames/frame_0001.exr`, unless the folder has it."""
         index = self.snapshots[0] if snapshot is None else snapshot
+        if export := EXPORTS.get(name):
+            return self._export(f"snapshots/{index}/exports/{export}", self.folder / f"snapshot_{index:04d}" / name)
         listed = self.job.client._get(f"/v1/jobs/{self.job.id}/snapshots/{index}")["files"]
         files = {file["name"]: file for file in listed if file["href"]}
         if name not in files:
-            raise KeyError(f"snapshot {index} has no file {name!r}; its files are {', '.join(files)}")
+            raise KeyError(f"snapshot {index} has no file {name!r}; its files are {', '.join([*files, *EXPORTS])}")
         file = files[name]
         path = self.folder / f"snapshot_{index:04d}" / name
         if not (path.is_file() and transfer.sha256(path) == file["sha256"]):
@@ -596,15 +637,48 @@ class Result:
                 transfer.download(http, href, path, sha256, bar)
         return path
 
+    def _export(self, href: str, path: Path) -> Path:
+        """Downloads a file that the service composes of stored ones. Its ETag identifies the content."""
+        if not path.is_file():
+            http, href = self.job.client.http, f"/v1/jobs/{self.job.id}/{href}"
+            etag = transfer.send(http, "HEAD", href).headers["ETag"].strip('"')
+            with self.job.client._bar(f"download {path.name}") as bar:
+                transfer.download(http, href, path, etag, bar, composed=True)
+        return path
+
     @property
     def manifest(self) -> Record:
         """The manifest of the job: inputs, parameters and results."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
 
 
-def describe(finding: Record) -> str:
-    """A finding as one line, with its remedy."""
-    place = f"snapshot {finding['snapshot']}: " if finding.get("snapshot") is not None else ""
+def sheared(mask: npt.NDArray[Any], dispersion: Record, size: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The masks [B, H, W] of the bands on a sensor of this size, from one mask [H, W]."""
+    axis = 1 if dispersion["axis"] == "column" else 0
+    masks = np.zeros((len(dispersion["offsets"]), *size))
+    for band, offset in zip(np.moveaxis(masks, axis + 1, -1), dispersion["offsets"], strict=True):
+        along = np.moveaxis(np.asarray(mask, np.float64).reshape(mask.shape[-2], mask.shape[-1]), axis, -1)
+        whole, fraction = int(offset), offset - int(offset)
+        for start, weight in ((whole, 1 - fraction), (whole + 1, fraction)):
+            count = max(0, min(along.shape[-1], band.shape[-1] - start))
+            band[:, start : start + count] += weight * along[:, :count]
+    return masks
+
+
+def describe_all(findings: Sequence[Record]) -> list[str]:
+    """Findings as lines with their remedies. Findings with the same code about several snapshots share a line."""
+    groups: dict[tuple[str, bool], list[Record]] = {}
+    for finding in findings:
+        groups.setdefault((finding["code"], finding.get("snapshot") is not None), []).append(finding)
+    return [
+        describe(group[0], [finding["snapshot"] for finding in group if finding.get("snapshot") is not None])
+        for group in groups.values()
+    ]
+
+
+def describe(finding: Record, snapshots: Sequence[int]) -> str:
+    numbers = ", ".join(map(str, snapshots[:9])) + (f" and {len(snapshots) - 9} more" if len(snapshots) > 9 else "")
+    place = f"snapshot{'s' if len(snapshots) > 1 else ''} {numbers}: " if snapshots else ""
     detail, remedy = finding["detail"].rstrip("."), finding["remedy"].rstrip(".")
     return f"{finding['severity']} {finding['code']}: {place}{detail}. Remedy: {remedy}."
 

@@ -9,6 +9,14 @@ class SciReconError(Exception):
     """The service, a job, or the connection to the service failed."""
 
 
+class FindingWarning(UserWarning):
+    """A check of the service found a problem of the masks, the measurement or the result."""
+
+
+class ConnectionWarning(UserWarning):
+    """The service can't be reached. The request is repeated for about five minutes."""
+
+
 class ApiError(SciReconError):
     """The service rejected a request.
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import random
+import socket
+import ssl
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +22,7 @@ import requests
 from tusclient.client import TusClient
 from tusclient.exceptions import TusCommunicationError, TusUploadFailed
 
-from ._errors import ApiError, SciReconError
+from ._errors import ApiError, ConnectionWarning, SciReconError
 
 Source = str | os.PathLike[str] | npt.NDArray[Any]
 Progress = Callable[[int, int], None]
@@ -64,8 +67,11 @@ def send(http: httpx.Client, method: str, path: str, **options: Any) -> httpx.Re
         try:
             response = http.request(method, path, **options)
         except httpx.TransportError as error:
-            if last or isinstance(error, httpx.UnsupportedProtocol):
+            if last or isinstance(error, httpx.UnsupportedProtocol) or is_lasting(error):
                 raise SciReconError(f"{method} {address(http, path)}: {error}") from error
+            if attempt == 0:
+                text = f"{http.base_url} can't be reached ({error}); the request is repeated for about five minutes"
+                warnings.warn(text, ConnectionWarning, stacklevel=4)
             pause(attempt)
             continue
         if response.is_success or response.status_code == 304:
@@ -75,6 +81,17 @@ def send(http: httpx.Client, method: str, path: str, **options: Any) -> httpx.Re
             raise rejection
         pause(attempt, response.headers.get("Retry-After"))
     raise AssertionError("unreachable")
+
+
+def is_lasting(error: BaseException | None) -> bool:
+    """True if a repetition would fail, too: the host is unknown, or its certificate is not trusted."""
+    while error is not None:
+        if isinstance(error, ssl.SSLCertVerificationError):
+            return True
+        if isinstance(error, socket.gaierror) and error.errno != socket.EAI_AGAIN:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 @contextmanager
@@ -150,8 +167,17 @@ def sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-def download(http: httpx.Client, href: str, path: Path, expected: str, progress: Progress | None = None) -> None:
-    """Downloads a file, resumes after a lost connection, and checks its SHA-256."""
+def download(
+    http: httpx.Client,
+    href: str,
+    path: Path,
+    expected: str,
+    progress: Progress | None = None,
+    *,
+    composed: bool = False,
+) -> None:
+    """Downloads a file, resumes after a lost connection, and checks its SHA-256. `expected` is its ETag; it is not the hash
+    of a `composed` file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # The name includes the hash, so that another process can resume the download of the same content.
     part = path.with_name(f".{path.name}.{expected[:16]}.part")
@@ -185,7 +211,7 @@ def download(http: httpx.Client, href: str, path: Path, expected: str, progress:
             if attempt == TRIES:
                 raise SciReconError(f"GET {href}: {error}") from error
             pause(attempt)
-    actual = sha256(part)
+    actual = expected if composed else sha256(part)
     if actual != expected:
         part.unlink()
         raise SciReconError(f"{href}: the downloaded file has the SHA-256 {actual}, not {expected}; download it again")

@@ -8,6 +8,7 @@ single job even if the program is restarted.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import time
@@ -16,12 +17,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ._client import Client, Job, Result, describe
+from ._client import Client, Job, Result, describe_all
 from ._errors import ApiError, JobFailed, SciReconError
 
 ENDINGS = {".npy", ".tif", ".tiff", ".png", ".mat", ".h5", ".hdf5"}
 LEDGER = ".sci-recon-watch.json"
+# The ledger of `sci-recon watch-folder`.
+OTHER_LEDGER = ".sci-recon.ledger"
 ENDED = {"succeeded", "failed", "cancelled"}
+FILES = ("frames.npy", "stack.tif", "manifest.json")
 
 # Submits a file with an idempotency key.
 Submit = Callable[[Path, str], Job]
@@ -39,7 +43,7 @@ class Watch:
         folder: str | os.PathLike[str],
         submit: Submit,
         *,
-        files: Sequence[str] = ("frames.npy", "manifest.json"),
+        files: Sequence[str] = FILES,
         own: Sequence[str | os.PathLike[str]] = (),
         settle_seconds: float = 3.0,
     ) -> None:
@@ -49,6 +53,12 @@ class Watch:
         self.files = files
         self.own = {Path(file).resolve() for file in own}
         self.settle_seconds = settle_seconds
+        self.failed = 0
+        self.doubtful = 0
+        if (self.folder / OTHER_LEDGER).exists():
+            raise SciReconError(
+                f"{self.folder} is watched by `sci-recon watch-folder`: use one of both, or remove {OTHER_LEDGER}"
+            )
         ledger = self.folder / LEDGER
         self.done: dict[str, str] = json.loads(ledger.read_text("utf-8")) if ledger.exists() else {}
         self.jobs: dict[str, tuple[Path, Job]] = {}
@@ -56,7 +66,8 @@ class Watch:
         self.settling: dict[str, float] = {}
 
     def run(self, once: bool = False) -> None:
-        """Watches until it is interrupted. With `once` it returns when all files are processed."""
+        """Watches until it is interrupted. With `once` it returns when all files are processed; `failed` and `doubtful` are
+        the numbers of files that failed, and of those with errors found by the checks."""
         while True:
             self.look()
             if once and not self.jobs and not self.settling:
@@ -119,16 +130,19 @@ class Watch:
         for snapshot in result.snapshots:
             for name in self.files:
                 result.download(name, snapshot)
-        lines = [f"{path.name}: {job.verdict}", "", *map(describe, job.findings), "", f"job {job.id}"]
+        findings = describe_all(job.findings)
+        lines = [f"{path.name}: {job.verdict}", "", *findings, "", f"job {job.id}"]
         draft.mkdir(exist_ok=True)
         (draft / "REPORT.txt").write_text("\n".join(lines) + "\n", "utf-8")
         folder = draft.rename(self._unused(path, ".result"))
         print(f"{path.name} is in {folder.name}: {job.verdict}", flush=True)
-        for finding in job.findings:
-            print(f"    {describe(finding)}", flush=True)
+        for line in findings:
+            print(f"    {line}", flush=True)
+        self.doubtful += any(finding["severity"] == "error" for finding in job.findings)
         self._record(key, folder.name)
 
     def _fail(self, key: str, path: Path, error: Exception) -> None:
+        self.failed += 1
         report = self._unused(path, ".failed.txt")
         report.write_text(f"{path.name}: {error}\n\nTo try again, save the file again.\n", "utf-8")
         print(f"{path.name} has failed: {error}", flush=True)
@@ -154,10 +168,11 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
     calibration = client.calibrate(
         masks,
         mosaic=options.pop("mosaic", None),
+        dispersion=options.pop("dispersion", None),
         bad_pixels=options.pop("bad_pixels", None),
         **{keyword: options.pop(option, None) for option, keyword in mask_options.items()},
     )
-    job_options = {"algorithm", "snapshots", "schedule", "tile", "model", "priority", "label"}
+    job_options = set(inspect.signature(Client.submit).parameters) - {"self", "measurement", "sequence", "key"}
     job = {name: value for name, value in options.items() if name in job_options}
     measurement = {name: value for name, value in options.items() if name not in job_options}
 

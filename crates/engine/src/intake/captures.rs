@@ -19,8 +19,8 @@ use formats::{
     StackWriter, png, read_stack,
 };
 use optics::{
-    Average, Calibrator, CaptureFigures, MaskFigures, MaskStudy, PatternFigures, References,
-    Repeats, check_patterns, judge_captures, judge_masks,
+    Average, Calibrator, CaptureFigures, Dispersion, MaskFigures, MaskStudy, PatternFigures,
+    References, Repeats, check_patterns, judge_captures, judge_masks,
 };
 
 /// Bytes of masks that are analysed at a time.
@@ -78,16 +78,20 @@ pub fn calibrate<W: Write>(
     let to = open(raw.info())?;
     let masks = write_scaled(&raw, captured.scale, bad.as_ref(), to, progress)?;
     let figures = study(&raw, captured.scale, progress)?;
-    let report = report_on(&figures, Some(&captured), patterns.as_ref())?;
+    let findings = judge_masks(&figures, patterns.as_ref().map(|patterns| patterns.view()));
+    let report = report_on(&figures, Some(&captured), findings)?;
     let Captured { sample, clipped_negatives, .. } = captured;
     Ok((Calibrated { report, sample, clipped_negatives }, masks))
 }
 
-/// Reports on uploaded masks \[B,H,W\] on \[0,1\].
+/// Reports on uploaded masks \[B,H,W\] on \[0,1\]. `spectral` is true for the bands of one mask.
 ///
 /// Errors: unreadable masks; [`IntakeError::Stopped`].
-pub fn report(masks: &Reader, progress: &mut Progress<'_>) -> Result<Report> {
-    report_on(&study(masks, 1.0, progress)?, None, None)
+pub fn report(masks: &Reader, spectral: bool, progress: &mut Progress<'_>) -> Result<Report> {
+    let figures = study(masks, 1.0, progress)?;
+    let mut findings = judge_masks(&figures, None);
+    findings.retain(|finding| !spectral || Dispersion::admits(finding.code));
+    report_on(&figures, None, findings)
 }
 
 /// The planned cost of a calibration from captures.
@@ -275,14 +279,12 @@ fn write_scaled<W: Write>(
     Ok(to.finish()?)
 }
 
-/// Checks masks and reports on them. `captured` is given for masks from captures, `patterns` if the intended patterns
-/// are known.
+/// Reports on masks with these findings. `captured` is given for masks from captures.
 fn report_on(
     figures: &MaskFigures,
     captured: Option<&Captured>,
-    patterns: Option<&Array3<f32>>,
+    mut findings: Vec<optics::Finding>,
 ) -> Result<Report> {
-    let mut findings = judge_masks(figures, patterns.map(|patterns| patterns.view()));
     let mut maps = vec![
         ("mean".to_owned(), picture(&figures.mean)?),
         ("deviation".to_owned(), picture(&figures.deviation)?),

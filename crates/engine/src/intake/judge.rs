@@ -5,7 +5,7 @@ use std::path::Path;
 
 use ndarray::{Array3, Axis};
 
-use crate::job::{Finding, FindingCode, Mosaic};
+use crate::job::{Dispersion, DispersionAxis, Finding, FindingCode, Mosaic};
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use optics::{
@@ -26,8 +26,8 @@ const SNAPSHOTS: usize = 8;
 /// ones, which looks like light that the masks do not explain.
 pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding> {
     use FindingCode::{
-        BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, Level, MaskScale, NegativeOffset,
-        NoDark, Saturated, ShiftedMasks, TurnedMasks, WrongDark,
+        BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, InvertedMasks, Level, MaskScale,
+        NegativeOffset, NoDark, Saturated, ShiftedMasks, TurnedMasks, WrongDark,
     };
     let is_one_of =
         |finding: &Finding, codes: &[FindingCode]| codes.iter().any(|code| finding.is(*code));
@@ -35,7 +35,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
         let found = findings.iter().filter(|finding| is_one_of(finding, codes));
         found.map(|finding| finding.snapshot).collect()
     };
-    let wrong_masks = [BinaryMeasurement, ShiftedMasks, TurnedMasks, ForeignMasks];
+    let wrong_masks = [BinaryMeasurement, InvertedMasks, ShiftedMasks, TurnedMasks, ForeignMasks];
     let with_wrong_masks = snapshots_with(&judged, &wrong_masks);
     let copies = snapshots_with(&judged, &[BinaryMeasurement]);
     read.retain(|finding| match finding {
@@ -57,6 +57,8 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
     findings.extend(read);
     findings.extend(others);
     findings.extend(bad_pixels);
+    // If masks were sent as the measurement, their scale is an effect.
+    findings.sort_by_key(|finding| !finding.is(BinaryMeasurement));
     findings
 }
 
@@ -66,7 +68,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
 /// Errors: files that can't be read.
 pub fn judge(
     (masks, snapshots): (&Path, &Path),
-    mosaic: Option<Mosaic>,
+    (mosaic, dispersion): (Option<Mosaic>, Option<&Dispersion>),
     dark_subtracted: bool,
     limits: &Limits,
 ) -> Result<Vec<Finding>, FormatError> {
@@ -76,7 +78,11 @@ pub fn judge(
     for sample in 0..count.min(SNAPSHOTS) {
         let snapshot = sample * count / count.min(SNAPSHOTS);
         let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
-        let Some(figures) = studied.finish() else { continue };
+        let Some(mut figures) = studied.finish() else { continue };
+        if let Some(dispersion) = dispersion {
+            // Neighbouring bands resemble one another, so the right masks explain hardly more than displaced ones.
+            figures.drift[usize::from(dispersion.axis == DispersionAxis::Column)].excess = 0.0;
+        }
         let number = u32::try_from(snapshot).ok();
         let mut judged = judge_measurement(&figures, dark_subtracted);
         if mosaic.is_none()
@@ -89,6 +95,7 @@ pub fn judge(
         }
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
+        judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
         let judged = judged.into_iter();
         findings
             .extend(judged.map(|finding| Finding { snapshot: number, ..Finding::from(finding) }));

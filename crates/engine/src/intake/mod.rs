@@ -13,6 +13,7 @@ mod read;
 mod refusal;
 mod report_page;
 mod sample;
+mod spectral;
 
 pub use bad_pixels::bad_pixels;
 pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
@@ -26,3 +27,4 @@ pub use read::{
 pub use refusal::{Refusal, RefusalCode};
 pub use report_page::report_page;
 pub use sample::{Sample, sample};
+pub use spectral::expected_size;

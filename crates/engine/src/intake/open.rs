@@ -5,8 +5,9 @@ use std::path::Path;
 use ndarray::Array2;
 
 use super::IntakeError;
+use super::spectral::sheared;
 use crate::intake::error::Result;
-use crate::job::{MAX_MASKS, Reading, ScaleBasis};
+use crate::job::{Dispersion, MAX_MASKS, Reading, ScaleBasis};
 use formats::mat::SceneArray;
 use formats::{
     self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, Packing, Part, SampleType,
@@ -18,7 +19,7 @@ use formats::{
 pub struct Source<'a> {
     pub path: &'a Path,
     pub array: SceneArray,
-    /// Name of the array in the file; `None` for [`SceneArray::name`].
+    /// Name of the array in the file; `None` for [`SceneArray::name`], or for the only array.
     pub named: Option<String>,
     /// Order of the axes; `None` for automatic detection.
     pub axes: Option<Axes>,
@@ -28,6 +29,8 @@ pub struct Source<'a> {
     pub part: Part,
     /// How pixels are packed; `None` for one number per pixel.
     pub packing: Option<Packing>,
+    /// Makes the masks of all bands from the only mask of the file.
+    pub dispersion: Option<Dispersion>,
     /// Stored value that means 1; `None` for the default of the file.
     pub full_scale: Option<f32>,
     pub limits: Limits,
@@ -65,8 +68,8 @@ impl<'a> Source<'a> {
         limits: Limits,
     ) -> Self {
         let (named, axes, size, name) = (None, None, None, String::new());
-        let (part, packing) = (Part::default(), None);
-        Self { path, array, named, axes, size, part, packing, full_scale, limits, name }
+        let (part, packing, dispersion) = (Part::default(), None, None);
+        Self { path, array, named, axes, size, part, packing, dispersion, full_scale, limits, name }
     }
 
     /// Selects the array with this name.
@@ -84,10 +87,16 @@ impl<'a> Source<'a> {
         Self { part, packing, ..self }
     }
 
+    /// Makes the masks of the bands of a spectral camera from the only mask of the file.
+    pub fn dispersed(self, dispersion: Option<Dispersion>) -> Self {
+        Self { dispersion, ..self }
+    }
+
     /// Opens the file. Masks of integers that are all 0 or 1 are closed and open, whatever their type.
     ///
     /// Errors: [`IntakeError::Format`] if the file is missing, unsupported or larger than the limits, if it does not
-    /// have the array, if several orders of its axes fit, or if the full scale is unknown.
+    /// have the array, if several orders of its axes fit, or if the full scale is unknown;
+    /// [`IntakeError::Content`] if the masks of bands can't be made from the file.
     pub fn open(&self) -> Result<Opened> {
         let mut opened = self.with_full_scale(self.open_array()?)?;
         let is_default = opened.reading.scale_basis == ScaleBasis::Type;
@@ -100,6 +109,10 @@ impl<'a> Source<'a> {
         if masks && is_default && integers && self.is_binary()? {
             opened.full_scale = FullScale::ONE;
             opened.reading.scale_basis = ScaleBasis::Values;
+        }
+        if let Some(dispersion) = &self.dispersion {
+            opened.reader = sheared(opened.reader, dispersion, &self.limits, &self.name)?;
+            opened.info = *opened.reader.info();
         }
         Ok(opened)
     }

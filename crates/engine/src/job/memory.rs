@@ -114,6 +114,7 @@ mod tests {
             calibration: CalibrationId::new(),
             measurement: MeasurementId::new(),
             shape: SceneShape { frames, height: side, width: side, snapshots: 1, mosaic: None },
+            dispersion: None,
             snapshots: SnapshotRange { first: 0, count: 1 },
             sequence: Sequence::Separate,
             run: RunSpec::ALONE,
@@ -121,8 +122,12 @@ mod tests {
             model: None,
             schedule: algorithm.default_schedule(),
             tile: TileSpec { size: side, overlap: 0 },
+            registration: crate::job::RegistrationRequest::Off,
+            registered: None,
             priority: 0,
+            truth: None,
             label: None,
+            webhook: None,
             warnings: Vec::new(),
         }
     }

@@ -9,6 +9,7 @@ mod memory;
 mod model;
 mod pool;
 mod reading;
+mod registration;
 mod report;
 mod request;
 mod shape;
@@ -16,6 +17,7 @@ mod state;
 mod submission;
 mod task;
 mod text;
+mod webhook;
 
 pub use access::{Lab, Role, Secret};
 pub use algorithm::Algorithm;
@@ -26,10 +28,11 @@ pub use ids::{
     WorkerId,
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
-pub use optics::{MARGIN, Mosaic};
+pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::{InvalidPool, Pool};
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
+pub use registration::{Registered, RegistrationRequest};
 pub use report::{
     CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, PatternReport,
     Severity,
@@ -45,3 +48,4 @@ pub use task::{
     TaskState, movie_step,
 };
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};
+pub use webhook::Webhook;

@@ -8,9 +8,12 @@ use serde::{Deserialize, Serialize};
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
 use super::model::{JobModel, ModelChoice};
+use super::registration::{Registered, RegistrationRequest};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
 use super::text::{InvalidField, Label};
+use super::webhook::Webhook;
+use super::{Dispersion, Sha256};
 use reconstruction::ReconError;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::SequencePlan;
@@ -120,13 +123,24 @@ pub struct JobRequest {
     /// The tiles; by default those of the algorithm, or the whole picture for a network of fixed size.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<TileSpec>,
+    /// `auto` estimates and corrects a displacement of the masks since the calibration, `{"shift": [rows, columns]}`
+    /// states it in pixels, and `off` uses the masks as they were calibrated; by default `auto`.
+    #[serde(default, skip_serializing_if = "RegistrationRequest::is_auto")]
+    pub registration: RegistrationRequest,
     /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
     #[schemars(range(min = -100, max = 100))]
     pub priority: i32,
+    /// An upload with the true frames of the selected snapshots' measurement, if they are known. PSNR and SSIM are
+    /// relative to them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub truth: Option<Sha256>,
     /// A name for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub label: Option<Label>,
+    /// The address to notify when the job ends; by default none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub webhook: Option<Webhook>,
 }
 
 /// A job after all checks, with all defaults filled in. It is stored and recorded in this form.
@@ -134,7 +148,11 @@ pub struct JobRequest {
 pub struct JobSpec {
     pub calibration: CalibrationId,
     pub measurement: MeasurementId,
+    /// The size of the measurement.
     pub shape: SceneShape,
+    /// Displacement of the bands of a spectral camera.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dispersion: Option<Dispersion>,
     pub snapshots: SnapshotRange,
     /// Temporal relation of the snapshots.
     pub sequence: Sequence,
@@ -146,8 +164,15 @@ pub struct JobSpec {
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
+    pub registration: RegistrationRequest,
+    /// The outcome of the registration; `None` before it, and if it is off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registered: Option<Registered>,
     pub priority: i32,
+    /// The upload with the true frames.
+    pub truth: Option<Sha256>,
     pub label: Option<Label>,
+    pub webhook: Option<Webhook>,
     pub warnings: Vec<Finding>,
 }
 
@@ -204,16 +229,19 @@ impl JobRequest {
             errors.push(InvalidField::new("/tile", error.to_string()));
             Cut { tile, run: RunSpec::ALONE }
         });
+        errors.extend(self.registration.error(shape.mosaic.is_some()));
         errors.extend(priority_error(self.priority));
         if !errors.is_empty() {
             return Err(errors);
         }
         let (measurement, algorithm) = (self.measurement, self.algorithm);
-        let (priority, label) = (self.priority, self.label);
+        let (priority, truth) = (self.priority, self.truth);
+        let (label, webhook) = (self.label, self.webhook);
         let spec = JobSpec {
             calibration,
             measurement,
             shape,
+            dispersion: None,
             snapshots,
             sequence,
             run,
@@ -221,8 +249,12 @@ impl JobRequest {
             model,
             schedule,
             tile,
+            registration: self.registration,
+            registered: None,
             priority,
+            truth,
             label,
+            webhook,
             warnings: Vec::new(),
         };
         match excess_tasks(&spec) {
@@ -275,6 +307,28 @@ impl SnapshotSelection {
 }
 
 impl JobSpec {
+    /// The size of the frames: that of the measurement, or of a band of a spectral camera.
+    pub fn frame_shape(&self) -> SceneShape {
+        self.shape.frame_shape(self.dispersion.as_ref())
+    }
+
+    /// The job for a spectral camera, if there is a dispersion.
+    ///
+    /// Errors: a stated shift of the masks, or snapshots that are to be reconstructed together.
+    pub fn with_dispersion(
+        self,
+        dispersion: Option<Dispersion>,
+    ) -> Result<Self, Vec<InvalidField>> {
+        if let Some(error) = self.registration.error(dispersion.is_some()) {
+            return Err(vec![error]);
+        }
+        if dispersion.is_some() && self.sequence == Sequence::Contiguous {
+            let detail = "the bands of two spectral snapshots do not continue one another: leave the sequence out";
+            return Err(vec![InvalidField::new("/sequence", detail)]);
+        }
+        Ok(Self { dispersion, ..self })
+    }
+
     /// The tile plan, the same for all snapshots.
     ///
     /// Errors: none for a spec from [`JobRequest::resolve`].

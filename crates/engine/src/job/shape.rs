@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, VariantNames};
 
 use formats::Channels;
-use optics::Mosaic;
+use optics::{Dispersion, Mosaic};
 use reconstruction::ReconError;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::SequencePlan;
@@ -192,6 +192,13 @@ pub struct SceneShape {
 }
 
 impl SceneShape {
+    /// The shape of the frames: the bands of a spectral camera are smaller than the measurement.
+    pub fn frame_shape(self, dispersion: Option<&Dispersion>) -> Self {
+        let sensor = (self.height, self.width);
+        let (height, width) = dispersion.map_or(sensor, |bands| bands.frame_size(sensor));
+        Self { height, width, ..self }
+    }
+
     /// Rows and columns of the images that the solver reconstructs: the picture, or each of the four sub-images of a
     /// mosaic.
     pub fn solved(self) -> (usize, usize) {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::captures::MAX_REPEATS;
 use super::reading::keeps_mosaic;
-use super::{CalibrationId, Captures, InvalidField, Label, Mosaic, Sequence, Sha256};
+use super::{CalibrationId, Captures, Dispersion, InvalidField, Label, Mosaic, Sequence, Sha256};
 use formats::{Axes, Crop, FullScale, Packing};
 
 /// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
@@ -53,6 +53,10 @@ pub struct CalibrationRequest {
     /// Colours of the sensor's pixels; a grey sensor has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mosaic: Option<Mosaic>,
+    /// Displacement of the bands of a spectral camera. `masks` is then one mask [row, column], from which the masks of all
+    /// bands are made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dispersion: Option<Dispersion>,
     /// A map of the size of the masks that is not 0 at bad pixels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bad_pixels: Option<Sha256>,
@@ -204,6 +208,24 @@ fn check_full_scale(full_scale: Option<f32>) -> Result<(), Vec<InvalidField>> {
 impl CalibrationRequest {
     fn check(&self) -> Result<(), Vec<InvalidField>> {
         let wrong = |pointer: &str, detail: &str| Err(vec![InvalidField::new(pointer, detail)]);
+        if let Some(dispersion) = &self.dispersion {
+            if self.captures.is_some() {
+                return wrong(
+                    "/dispersion",
+                    "a dispersion needs a mask: make it from the captures with `sci-recon calibrate`, and name it as \
+                     `masks`",
+                );
+            }
+            if self.mosaic.is_some() {
+                return wrong(
+                    "/dispersion",
+                    "a spectral camera has a grey sensor: leave the mosaic out",
+                );
+            }
+            if let Err(error) = dispersion.check() {
+                return wrong(&format!("/dispersion{}", error.pointer), &error.detail);
+            }
+        }
         match (&self.masks, &self.captures) {
             (Some(_), None) if self.mosaic.is_some() && !keeps_mosaic(self.crop) => {
                 wrong("/crop", "the window of a mosaic starts at an even row and an even column")

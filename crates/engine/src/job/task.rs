@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, IntoStaticStr, VariantArray, VariantNames};
 
+use super::registration::RegistrationRequest;
 use super::request::JobSpec;
 use super::shape::SceneShape;
 use super::text::Sha256;
@@ -10,6 +11,8 @@ use reconstruction::{ReconError, crop, joints, preview};
 
 /// CPU seconds per voxel that is read (measured).
 const READ_S: f64 = 12e-9;
+/// CPU seconds per frame of the registration of masks on its piece of fixed size. Median of `make eval-registration`.
+const REGISTRATION_S: f64 = 0.07;
 /// CPU seconds per voxel that is blended and written in all formats (measured).
 const WRITE_S: f64 = 110e-9;
 /// CPU seconds per voxel of a preview by blocks (measured).
@@ -170,7 +173,12 @@ impl JobSpec {
         let pixels = (self.shape.height * self.shape.width) as f64;
         let frames = self.shape.frames as f64;
         let per_voxel = self.planned_ns_per_voxel() * 1e-9;
-        let mut tasks = vec![(TaskKind::Prepare, pixels * (frames + 1.0) * READ_S)];
+        let registration = match (self.registration, self.shape.mosaic) {
+            (RegistrationRequest::Auto, None) => frames * REGISTRATION_S,
+            _ => 0.0,
+        };
+        let prepare = pixels * (frames + 1.0) * READ_S + registration;
+        let mut tasks = vec![(TaskKind::Prepare, prepare)];
         let (height, width) = self.shape.solved();
         let full_resolution = preview::block(self.shape.frames, height, width) == 1;
         let write_s = WRITE_S * self.shape.channels().count() as f64;
@@ -215,7 +223,7 @@ impl JobSpec {
     /// Planned CPU seconds of the movie of one snapshot, or of all snapshots for `None`.
     #[allow(clippy::cast_precision_loss)] // counts far below 2^53
     pub fn movie_cost(&self, format: MovieFormat, snapshot: Option<u32>) -> f64 {
-        let SceneShape { frames, height, width, .. } = self.shape;
+        let SceneShape { frames, height, width, .. } = self.frame_shape();
         let snapshots = if snapshot.is_some() { 1 } else { self.snapshots.count as usize };
         let samples = snapshots * frames * height * width * self.shape.channels().count();
         let written = snapshots as u64 * frames as u64 * self.movie_samples();
@@ -239,16 +247,17 @@ impl JobSpec {
 
     /// True if the frames are large enough for a movie in this format.
     pub fn has_movie(&self, format: MovieFormat) -> bool {
-        let SceneShape { height, width, .. } = self.shape;
+        let SceneShape { height, width, .. } = self.frame_shape();
         format == MovieFormat::Gif
             || height.min(width).div_ceil(movie_step(height, width)) >= MIN_MOVIE_SIDE
     }
 
     /// Number of samples in a frame of a movie.
     pub(super) fn movie_samples(&self) -> u64 {
-        let step = movie_step(self.shape.height, self.shape.width);
+        let SceneShape { height, width, .. } = self.frame_shape();
+        let step = movie_step(height, width);
         let side = |length: usize| length.div_ceil(step) as u64;
-        side(self.shape.height) * side(self.shape.width) * self.shape.channels().count() as u64
+        side(height) * side(width) * self.shape.channels().count() as u64
     }
 }
 

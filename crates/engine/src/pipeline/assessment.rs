@@ -72,7 +72,9 @@ impl TileAssessment {
             ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, 254.0) as u8
         };
         let (_, rows, columns) = errors.dim();
-        let motion = fastest(outcome.frames.view(), white);
+        // The estimate of frames that are mostly wrong is unbounded, and the server refuses impossible records.
+        let (_, height, width) = outcome.frames.dim();
+        let motion = fastest(outcome.frames.view(), white).max(0.0).min((height + width) as f32);
         let levels = errors.iter().map(level).collect();
         let prediction = evidence.and_then(|evidence| evidence.prediction);
         let order = evidence.and_then(|evidence| evidence.order);
@@ -124,11 +126,12 @@ const BAD_DB: f64 = 22.0;
 
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
 /// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
-/// of the PSNR. `None` if a tile has none, or if no tile has light.
+/// of the PSNR. With `spectral` frames are bands, which neither move nor have an order in time. `None` if a tile has none, or
+/// if no tile has light.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
-    schedule: &Schedule,
+    (schedule, spectral): (&Schedule, bool),
     (frames, normalisation, white_level): (usize, f32, f32),
     warnings: &[Finding],
 ) -> Option<Expected> {
@@ -143,10 +146,12 @@ pub fn expected(
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
             lit |= !assessed.is_dark();
-            motion = motion.max(assessed.motion);
+            if !spectral {
+                motion = motion.max(assessed.motion);
+                orders.extend(assessed.order);
+            }
             unfamiliar |= assessed.unfamiliar;
             predictions.extend(assessed.prediction);
-            orders.extend(assessed.order);
             let weights = plan.weights(&tile);
             let inside = |at: usize, first: usize, length: usize| {
                 at.checked_sub(first).filter(|at| *at < length)
@@ -186,6 +191,8 @@ pub fn expected(
     reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
     reasons.extend(unfamiliar.then(unfamiliar_masks_finding));
+    // An uneven error is an effect of the other causes.
+    reasons.sort_by_key(|reason| reason.is(FindingCode::UnevenError));
     let stated = |decibels| (!is_in_doubt(&reasons)).then(|| Assessment::round(decibels));
     let assessment = Assessment {
         grade: grade((psnr_db, high), &reasons),
@@ -202,16 +209,17 @@ pub fn expected(
 /// knows only results with the right ones.
 fn is_in_doubt(findings: &[Finding]) -> bool {
     use FindingCode::{
-        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks, MaskScale,
-        MissingPattern, Mosaic, Negative, NegativeOffset, NoDark, ShiftedMasks, TurnedMasks,
-        UnexplainedPixels, WrongDark,
+        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
+        InvertedMasks, MaskScale, MissingPattern, Mosaic, Negative, NegativeOffset, NoDark,
+        ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
     };
-    const DOUBTS: [FindingCode; 15] = [
+    const DOUBTS: [FindingCode; 16] = [
         BadCalibration,
         BinaryMeasurement,
         DriftedMasks,
         ExchangedMasks,
         ForeignMasks,
+        InvertedMasks,
         MaskScale,
         MissingPattern,
         Mosaic,
@@ -418,7 +426,7 @@ mod tests {
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
         let assess_at = |peak, tiles: Vec<Option<TileAssessment>>| {
             let shares = [(shares[0].clone(), tiles)];
-            expected(&plan, &shares, &Schedule::gap_tv(), (2, 0.5, peak), &[])
+            expected(&plan, &shares, (&Schedule::gap_tv(), false), (2, 0.5, peak), &[])
         };
         let assess = |tiles| assess_at(1.0, tiles);
         let tiles =

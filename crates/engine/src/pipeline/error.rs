@@ -71,7 +71,9 @@ impl PipelineError {
     /// True if another attempt may succeed, because the machine failed and not the data.
     pub fn is_retryable(&self) -> bool {
         match self {
-            Self::Recon(error) => matches!(error, ReconError::Runtime(_)),
+            Self::Recon(error) => {
+                matches!(error, ReconError::Runtime(_) | ReconError::DeviceLost(_))
+            }
             Self::Format(error) => !error.is_callers_fault(),
             Self::Snapshot { .. }
             | Self::Record { .. }

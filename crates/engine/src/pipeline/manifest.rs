@@ -5,14 +5,15 @@
 
 use std::collections::BTreeMap;
 
+use ndarray::{Array2, Axis};
 use serde::{Serialize, Serializer};
 
-use super::assessment::{Expected, TileAssessment, expected};
+use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::networks::ModelRecord;
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
 use crate::job::{
-    Algorithm, Assessment, CalibrationId, Finding, JobId, JobSpec, Label, MeasurementId, Mosaic,
-    ResultFile, SceneShape, Schedule, Sha256, TaskKind,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
+    MeasurementId, Mosaic, Registered, ResultFile, SceneShape, Schedule, Sha256, TaskKind,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -38,6 +39,9 @@ pub struct Recipe {
     /// The decisions of the pilot that led to this schedule.
     pub pilot: Option<PilotRecord>,
     pub inputs: Inputs,
+    /// The registration of the masks, unless it is off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub registration: Option<Registered>,
     /// The networks of the schedule, or the model of the job.
     pub models: Vec<ModelRecord>,
     pub scale: ScaleRecord,
@@ -51,6 +55,8 @@ pub struct Recipe {
     /// The size, which is not serialised here, and the mosaic with the demosaicking method; null for a grey sensor.
     #[serde(rename = "colour", serialize_with = "colour")]
     pub shape: SceneShape,
+    /// Displacement of the bands of a spectral camera; null for frames of a video.
+    pub dispersion: Option<Dispersion>,
     /// Snapshots per second, and exposure time of a snapshot in seconds, where known.
     #[serde(skip)]
     pub camera: (Option<f64>, Option<f64>),
@@ -99,6 +105,14 @@ impl Recipe {
         self.warnings.iter().filter(|warning| concerns(warning)).cloned().collect()
     }
 
+    /// A frame of the result from a reconstructed frame \[H,W\]: of a spectral camera, the band in its place.
+    pub fn frame(&self, k: usize, solved: Array2<f32>) -> Array2<f32> {
+        match &self.dispersion {
+            Some(dispersion) => dispersion.unshear(solved.view(), k),
+            None => solved,
+        }
+    }
+
     /// Predicts the quality of a snapshot, given by its index in the measurement. `shares` has the runs that contain
     /// it, each with the assessments of its tiles in the plan's order. `None` behind a mosaic, for which the model is
     /// not fitted.
@@ -111,7 +125,18 @@ impl Recipe {
             return None;
         }
         let scale = (self.shape.frames, self.scale.normalisation, self.scale.white_level);
-        expected(&self.tile_plan, shares, &self.schedule, scale, &self.warnings_of(snapshot))
+        let input = (&self.schedule, self.dispersion.is_some());
+        let warnings = self.warnings_of(snapshot);
+        let mut expected = expected(&self.tile_plan, shares, input, scale, &warnings)?;
+        if let Some(dispersion) = &self.dispersion {
+            let sensor = (self.shape.height, self.shape.width);
+            let bands = expected.error.outer_iter().enumerate();
+            let bands = bands.map(|(k, error)| dispersion.unshear_blocks(error, k, sensor, BLOCK));
+            let bands: Vec<_> = bands.collect();
+            let views: Vec<_> = bands.iter().map(|band| band.view()).collect();
+            expected.error = ndarray::stack(Axis(0), &views).ok()?;
+        }
+        Some(expected)
     }
 
     /// The manifest of a snapshot, given by its index in the measurement. Its list of files is empty.
@@ -122,10 +147,16 @@ impl Recipe {
         assessment: Option<Assessment>,
         run: RunRecord,
     ) -> Manifest {
-        let SceneShape { frames, height, width, .. } = self.shape;
+        let SceneShape { frames, height, width, .. } =
+            self.shape.frame_shape(self.dispersion.as_ref());
+        // All bands are exposed at the same time.
+        let camera = match self.dispersion {
+            Some(_) => None,
+            None => CameraRecord::new(self.camera, snapshot, frames),
+        };
         let recipe = Self { warnings: self.warnings_of(snapshot), ..self.clone() };
         let content = Content {
-            camera: CameraRecord::new(self.camera, snapshot, frames),
+            camera,
             recipe,
             frames,
             height,
@@ -160,6 +191,7 @@ impl Recipe {
             run: JobRun {
                 run: RunRecord::ended(Some(job.to_string()), cost, None),
                 label: spec.label.clone(),
+                truth_sha256: spec.truth,
                 calibration: spec.calibration,
                 measurement: spec.measurement,
                 tasks: seconds.len() + 1,
@@ -307,6 +339,8 @@ struct JobRun {
     #[serde(flatten)]
     run: RunRecord,
     label: Option<Label>,
+    /// The upload with the true frames; null if they are unknown.
+    truth_sha256: Option<Sha256>,
     calibration: CalibrationId,
     measurement: MeasurementId,
     /// Number of tasks.
@@ -340,9 +374,11 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
     let exposure = camera.and_then(|camera| camera.frame_exposure_s(content.frames));
     let frame = |k: usize| {
         let mut texts = shared.clone();
-        texts.push(("frame".to_owned(), format!("{} of {}", k + 1, content.frames)));
+        let part = if recipe.dispersion.is_some() { "band" } else { "frame" };
+        texts.push((part.to_owned(), format!("{} of {}", k + 1, content.frames)));
         Attributes {
             texts,
+            wavelength_nm: recipe.dispersion.as_ref().and_then(|bands| bands.wavelength(k)),
             frame_time_s: times.and_then(|times| times.get(k).copied()),
             frames_per_second: exposure.map(|seconds| 1.0 / seconds),
             exposure_s: exposure.map(|seconds| seconds as f32),
@@ -359,6 +395,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         algorithm: Algorithm::GapTv,
         schedule: Schedule::gap_tv(),
         pilot: None,
+        registration: None,
         shape: SceneShape { frames, height: 20, width: 24, snapshots: 2, mosaic: None },
         inputs: Inputs {
             masks_sha256: hash,
@@ -376,6 +413,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
         tile_plan: TilePlan::new(20, 24, 256, 32).unwrap(),
         runs: SequencePlan::separate(0..2),
         warnings: Vec::new(),
+        dispersion: None,
         camera: (Some(50.0), Some(0.012)),
     };
     recipe.snapshot(1, Vec::new(), None, RunRecord::ended(None, CostRecord::default(), None))

@@ -15,6 +15,7 @@ pub mod preview;
 pub mod progress;
 pub mod quality;
 pub mod records;
+pub mod registration;
 pub mod residual;
 pub mod scale;
 pub mod sequence;

@@ -7,6 +7,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
+use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 use sha2::Digest;
 
@@ -138,6 +139,9 @@ fn read(path: &Path) -> Result<Vec<u8>, NetworkError> {
     fs::read(path).map_err(|reason| NetworkError::Model { path: path.to_owned(), reason })
 }
 
+/// Largest accepted difference between a device and the CPU in the pass at the start, on frames of [0, 1].
+/// Half of a grey level of 8 bits; sound devices stay below 1e-5.
+const MAX_DIFFERENCE: f32 = 2e-3;
 /// File name of the library.
 const LIBRARY: &str = "libonnxruntime.so";
 /// Folders that are searched for the library, relative to that of the program: the same folder, the destinations of
@@ -158,6 +162,18 @@ pub enum NetworkError {
         "the file of the network is damaged: its SHA-256 is {actual}, but should be {expected}"
     )]
     Damaged { expected: Sha256, actual: Sha256 },
+    #[error(
+        "the device {device} can't be used: {reason}. It needs a libonnxruntime with {provider}, which \
+         `scripts/fetch-onnxruntime.sh --{option} FOLDER` downloads, and {driver}. docs/GPU.md has the steps; \
+         --device cpu needs neither"
+    )]
+    Device {
+        device: Device,
+        provider: &'static str,
+        option: &'static str,
+        driver: &'static str,
+        reason: String,
+    },
     /// The library was found, but does not load or run the network.
     #[error(transparent)]
     Runtime(#[from] ReconError),
@@ -197,7 +213,7 @@ impl NetworkSource {
     /// The variant of a network for the device. 8-bit networks are faster on CPUs only.
     fn for_device(&self, network: Network) -> Network {
         match (network, self.device) {
-            (Network::FastDvdNetInt8, Device::Cuda(_)) => Network::FastDvdNet,
+            (Network::FastDvdNetInt8, Device::Gpu | Device::Cuda(_)) => Network::FastDvdNet,
             _ => network,
         }
     }
@@ -215,6 +231,54 @@ impl NetworkSource {
     /// Name of the execution provider, for records.
     pub fn provider(&self) -> &'static str {
         self.device.provider()
+    }
+
+    /// The device that runs the networks.
+    pub fn device(&self) -> Device {
+        self.device
+    }
+
+    /// Runs a small network on the device and compares the result with the CPU's. Does nothing for the CPU.
+    ///
+    /// # Errors
+    /// [`NetworkError::Device`] with the reason and the remedy.
+    pub fn try_device(&self) -> Result<(), NetworkError> {
+        if self.device == Device::Cpu {
+            return Ok(());
+        }
+        self.agreement().map(drop).map_err(|reason| {
+            let (option, driver) = match self.device {
+                Device::Cuda(_) => ("cuda", "NVIDIA's driver with CUDA and cuDNN"),
+                Device::Cpu | Device::Gpu => ("gpu", "a Vulkan driver of the card with libvulkan1"),
+            };
+            let (device, provider) = (self.device, self.device.provider());
+            NetworkError::Device { device, provider, option, driver, reason }
+        })
+    }
+
+    /// Largest difference between the device and the CPU in a pass of FFDNet over a small ramp.
+    fn agreement(&self) -> Result<f32, String> {
+        let text = |error: &dyn std::fmt::Display| error.to_string();
+        let path = self.path().map_err(|error| text(&error))?;
+        let files = carried(Network::FfdNet).files.iter().map(|(_, content)| *content);
+        let files: Vec<&[u8]> = files.collect();
+        let pass = |device| -> Result<Array3<f32>, ReconError> {
+            let runtime = Runtime::open(&path, device)?;
+            let mut frames =
+                Array3::from_shape_fn((1, 16, 16), |(_, i, j)| (i * 16 + j) as f32 / 255.0);
+            ClipDenoiser::load(&runtime, Network::FfdNet, &files)?.denoise(&mut frames, 0.1)?;
+            Ok(frames)
+        };
+        let on_device = pass(self.device).map_err(|error| text(&error))?;
+        let on_cpu = pass(Device::Cpu).map_err(|error| text(&error))?;
+        let difference = on_device.iter().zip(&on_cpu).map(|(a, b)| (a - b).abs());
+        // `f32::max` would drop a NaN.
+        let largest =
+            difference.fold(0.0, |one: f32, other| if other <= one { one } else { other });
+        if largest <= MAX_DIFFERENCE {
+            return Ok(largest);
+        }
+        Err(format!("its results differ from the CPU's by {largest}, more than {MAX_DIFFERENCE}"))
     }
 
     /// Version of the library, for records; loads it.
@@ -407,6 +471,7 @@ mod tests {
         };
         assert_eq!(names(Device::Cpu), ["fastdvdnet-gray", "fastdvdnet-gray-int8"]);
         assert_eq!(names(Device::Cuda(0)), ["fastdvdnet-gray"]);
+        assert_eq!(names(Device::Gpu), ["fastdvdnet-gray"]);
     }
 
     #[test]

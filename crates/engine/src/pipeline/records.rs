@@ -4,17 +4,20 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::assessment::TileAssessment;
-use crate::job::{Assessment, ResultFile, Timestamp};
+use crate::job::{Assessment, Registered, ResultFile, Timestamp};
 use reconstruction::assessment::Evidence;
 use reconstruction::pilot::Decided;
 use reconstruction::schedule::Schedule;
 use reconstruction::solver::Outcome;
 
 /// The record of the task that prepares a job.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct PreparedRecord {
     /// The solver's scale, for all snapshots and tiles of the job.
     pub white: f32,
+    /// The registration of the masks, unless it is off.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub registration: Option<Registered>,
 }
 
 /// The record of the task that determines the white level of a job.

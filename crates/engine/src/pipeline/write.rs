@@ -37,6 +37,8 @@ const ENTRIES: [&str; 7] = [FRAMES, PNGS, STACK, ARRAY, RAW, ERROR, MANIFEST];
 /// Behind a mosaic frames are demosaicked: EXR has the channels R, G and B, PNG is in colour, `frames.npy` is
 /// \[B,H,W,3\], and `mosaic.npy` \[B,H,W\] has the raw values.
 ///
+/// The bands of a spectral camera are moved to their place; EXR channels have the names of their wavelengths.
+///
 /// `frame(k)` \[H,W\] is called once per frame, in order; one frame at a time is in memory. All files are synced to disk on
 /// return.
 ///
@@ -54,7 +56,8 @@ pub fn write_result(
     let (height, width) = (manifest.content.height, manifest.content.width);
     let (count, white) = (manifest.content.frames, manifest.content.recipe.scale.white_level);
     let array = BufWriter::new(File::create(folder.join(ARRAY)).map_err(failed(ARRAY))?);
-    let shape = manifest.content.recipe.shape;
+    let recipe = manifest.content.recipe.clone();
+    let shape = recipe.shape;
     let channels = shape.channels();
     let mut array = npy::writer(array, (count, height, width), channels)?;
     let mut raw = match shape.mosaic {
@@ -66,7 +69,7 @@ pub fn write_result(
     };
     let stack = folder.join(STACK);
     exr::write_stack(&stack, (height, width), channels, &attributes, |k| {
-        let mut frame = frame(k)?;
+        let mut frame = recipe.frame(k, frame(k)?);
         if let Some((mosaic, raw)) = &mut raw {
             raw.write_frame(frame.view())?;
             frame = mosaic.demosaick(frame.view(), (0, 0));

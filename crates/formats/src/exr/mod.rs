@@ -1,6 +1,6 @@
 //! OpenEXR: 32-bit float frames, one per file or one per part, with their provenance as attributes.
 //!
-//! Every part has the channel `Y`, or the channels `R`, `G` and `B`, in scan lines. Values are stored bit for bit.
+//! Every part has the channel `Y`, a channel with the name of a wavelength, or the channels `R`, `G` and `B`, in scan lines. Values are stored bit for bit.
 
 mod head;
 mod layer;

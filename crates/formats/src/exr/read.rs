@@ -8,7 +8,7 @@ use std::path::Path;
 use ::exr::block;
 use ::exr::block::reader::ChunksReader;
 use ::exr::error::Error as ExrError;
-use ::exr::meta::attribute::{AttributeValue, SampleType, Text};
+use ::exr::meta::attribute::{AttributeValue, ChannelDescription, SampleType, Text};
 use ::exr::meta::header::Header;
 use ndarray::Array3;
 
@@ -69,8 +69,12 @@ fn common_layout(headers: &[Header]) -> Result<(usize, usize, Channels)> {
         let stored = &header.channels.list;
         let fits = |channels: &Channels| {
             let mut pairs = stored.iter().zip(names(*channels));
+            let is_named = |c: &ChannelDescription, name: &str| {
+                c.name.eq(name)
+                    || (*channels == Channels::Grey && c.name.to_string().starts_with("S0."))
+            };
             stored.len() == channels.count()
-                && pairs.all(|(c, (name, _))| c.name.eq(name) && c.sample_type == SampleType::F32)
+                && pairs.all(|(c, (name, _))| is_named(c, name) && c.sample_type == SampleType::F32)
         };
         [Channels::Grey, Channels::Rgb].into_iter().find(fits)
     };

@@ -24,6 +24,7 @@ fn attributes(k: usize) -> Attributes {
         frame_time_s: Some(0.1 * k as f64),
         frames_per_second: Some(1000.0 / 3.0),
         exposure_s: Some(0.01),
+        wavelength_nm: None,
     }
 }
 
@@ -41,6 +42,23 @@ fn frames_are_stored_bit_for_bit_with_their_attributes() {
     assert_eq!(part.frame_time_s, Some(0.1 * 3.0));
     assert_eq!(part.frames_per_second, Some((333_333, 1000)));
     assert_eq!(part.name, "");
+}
+
+#[test]
+fn channels_of_bands_have_the_names_of_their_wavelengths() {
+    let stack = ramp((2, 5, 7), 1 << 20);
+    let path = tempfile::NamedTempFile::new().unwrap();
+    let part = |wavelength| Attributes { wavelength_nm: Some(wavelength), ..attributes(0) };
+    write_stack(path.path(), (5, 7), Channels::Grey, &[part(453.25), part(700.0)], |k| {
+        Ok::<_, FormatError>(stack.index_axis(ndarray::Axis(0), k).to_owned())
+    })
+    .unwrap();
+    let bytes = std::fs::read(path.path()).unwrap();
+    for name in [&b"S0.453,25nm\0"[..], b"S0.700nm\0"] {
+        assert!(bytes.windows(name.len()).any(|window| window == name));
+    }
+    let (_, back) = read_stack(path.path(), &Limits::default()).unwrap();
+    assert_eq!(bits(&back), bits(&stack));
 }
 
 #[test]

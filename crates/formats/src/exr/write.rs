@@ -36,6 +36,8 @@ pub struct Attributes {
     pub frames_per_second: Option<f64>,
     /// Exposure time in seconds: OpenEXR's `expTime` (float).
     pub exposure_s: Option<f32>,
+    /// Wavelength of a grey frame in nanometres, which names its channel.
+    pub wavelength_nm: Option<f64>,
 }
 
 /// Writes one frame (row, column), and replaces an existing file. All channels of a pixel are in adjacent columns.
@@ -95,6 +97,13 @@ fn part_name(index: usize) -> String {
     format!("frame_{:04}", index + 1)
 }
 
+/// Name of the channel of a wavelength in the layout of spectral EXR images (Fichet, Pacanowski and Wilkie 2021), with a
+/// decimal comma because dots separate layers.
+fn spectral_name(wavelength_nm: f64) -> String {
+    let rounded = (wavelength_nm * 1000.0).round() / 1000.0;
+    format!("S0.{}nm", rounded.to_string().replace('.', ","))
+}
+
 fn header(
     (height, width): (usize, usize),
     channels: Channels,
@@ -104,8 +113,11 @@ fn header(
     if height == 0 || width == 0 {
         return Err(FormatError::Internal(format!("an EXR frame of {height}x{width} is empty")));
     }
-    let channels = names(channels).iter().map(|(name, _)| *name);
-    let channels = channels.map(|name| ChannelDescription::named(name, SampleType::F32));
+    let names = match (channels, attributes.wavelength_nm) {
+        (Channels::Grey, Some(wavelength)) => vec![spectral_name(wavelength)],
+        _ => names(channels).iter().map(|(name, _)| (*name).to_owned()).collect(),
+    };
+    let channels = names.iter().map(|name| ChannelDescription::named(&**name, SampleType::F32));
     let header = Header::new(Text::from(""), Vec2(width, height), channels.collect());
     let mut own = LayerAttributes {
         layer_name: name.as_deref().map(Text::from),

@@ -92,6 +92,14 @@ fn arrays_in_groups_are_listed_by_their_paths() {
 }
 
 #[test]
+fn the_names_of_a_file_list_variables_once() {
+    let names = |name| super::names(std::fs::File::open(sample(name)).unwrap()).unwrap();
+    assert!(names("octave.h5").iter().any(|name| name == "shots"), "{:?}", names("octave.h5"));
+    assert!(names("octave.h5").iter().all(|name| !name.contains('/')), "{:?}", names("octave.h5"));
+    assert_eq!(names("user-block.h5"), ["mask"]);
+}
+
+#[test]
 fn variables_of_octave_are_read() {
     let (info, values) = read("octave.h5", SceneArray::Masks).unwrap();
     assert_eq!((info.sample, values), (SampleType::Bool, masks()));
@@ -154,7 +162,7 @@ fn errors_state_what_is_supported() {
     let Err(large) = open_array(&sample("h5py.h5"), SceneArray::Masks, &small) else { panic!() };
     assert_names(&large.to_string(), &["number of frames is 3", "limit is 2"]);
     let error = read_stack(&sample("h5py.h5"), &Limits::default()).unwrap_err();
-    assert_names(&error.to_string(), &["HDF5", "a scene of several arrays"]);
+    assert_names(&error.to_string(), &["HDF5", "'mask'", "save the array alone"]);
 }
 
 #[test]

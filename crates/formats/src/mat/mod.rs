@@ -25,6 +25,19 @@ use super::scene::list;
 use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
+/// The names of the arrays of numbers. Errors: damaged files.
+pub(super) fn names(file: File, length: u64) -> Result<Vec<String>> {
+    let mut elements = Elements::new(BufReader::new(file), length)?;
+    let mut names = Vec::new();
+    while let Some(element) = elements.next()? {
+        let header = ArrayHeader::read(&mut elements.content(element)?)?;
+        if header.sample_type().is_ok() {
+            names.push(header.name);
+        }
+    }
+    Ok(names)
+}
+
 /// Opens the array with this name. Errors: [`FormatError::MissingArray`]; damaged files; [`FormatError::Unsupported`]
 /// for other classes than double, single, logical and integers; [`FormatError::OverLimit`].
 pub(super) fn open(

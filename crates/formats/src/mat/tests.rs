@@ -8,7 +8,7 @@ use proptest::prelude::{any, proptest};
 
 use super::SceneArray;
 use crate::test_support::{assert_names, every_order, file, ramp, read_as, refusal};
-use crate::{Axes, FormatError, Limits, SampleType, collect, open_array};
+use crate::{Axes, FormatError, Limits, SampleType, collect, open_array, read_stack};
 
 /// The level 5 class and storage type of an array, and its samples as bytes.
 struct Numbers {
@@ -161,7 +161,28 @@ fn unsupported_arrays_are_refused_by_name() {
     assert_names(&refused(&mat(&[], false)), &["no array named 'mask'", "no arrays"]);
     let four = matrix("mask", &[1, 2, 2, 1], &numbers(6, 9), false);
     assert_names(&refused(&mat(&[four], false)), &["4 dimensions", "(row, column, frame)"]);
-    assert_names(&refusal(&mat(&others, false)), &["scene of several arrays"]);
+    assert_names(&refusal(&mat(&others, false)), &["'meas', 'other'", "save the array alone"]);
+}
+
+#[test]
+fn the_only_array_is_read_whatever_its_name() {
+    for name in ["dark", "orig", "mask"] {
+        let frames = ramp((3, 4, 5), 256);
+        let path = file(&mat(&[element(name, &frames)], false));
+        let (info, values) = read_stack(path.path(), &Limits::default()).unwrap();
+        let scale = info.default_full_scale.map(|scale| scale.value());
+        assert_eq!((scale, values), (Some(1.0), frames.clone()), "{name}");
+    }
+    let shots = ramp((3, 4, 5), 256);
+    let text = Numbers { class: 4, storage: 4, bytes: vec![0; 8] };
+    let note = matrix("note", &[2, 2], &text, false);
+    let bytes = mat(&[note, element("shots", &shots)], false);
+    for array in [SceneArray::Masks, SceneArray::Measurements, SceneArray::Truth] {
+        assert_eq!(read(&bytes, array).unwrap(), shots);
+    }
+    // The usual name of another role is not taken.
+    let bytes = mat(&[element("meas", &shots)], false);
+    assert_names(&refused(&bytes), &["no array named 'mask'", "'meas'"]);
 }
 
 #[test]

@@ -1,11 +1,12 @@
 //! ONNX Runtime. No other file uses `ort`.
 
+use std::fmt;
 use std::path::Path;
 use std::sync::OnceLock;
 
 use ndarray::{Array3, ArrayView2, ArrayView3, ArrayView4, Axis};
 use ort::environment::Environment;
-use ort::ep::CUDA;
+use ort::ep::{CUDA, WebGPU};
 use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
 use ort::value::{Outlet, Tensor, TensorElementType, TensorRef, ValueType};
@@ -21,22 +22,36 @@ pub enum Device {
     /// The processor, one thread a session.
     #[default]
     Cpu,
+    /// The first adapter of the WebGPU execution provider: a GPU of any vendor.
+    Gpu,
     /// The CUDA device with this number.
     Cuda(i32),
 }
 
 impl Device {
-    /// Reads `cpu` or `cuda:N`.
+    /// Reads `cpu`, `gpu`, `gpu:0` or `cuda:N`.
+    ///
+    /// # Errors
+    /// The text has another form, or names an adapter that the WebGPU provider can't select.
     pub fn parse(text: &str) -> Result<Self> {
-        let cuda = text.strip_prefix("cuda:").and_then(|number| number.parse().ok());
-        match (text, cuda) {
-            ("cpu", _) => Ok(Self::Cpu),
-            (_, Some(number)) if number >= 0 => Ok(Self::Cuda(number)),
-            _ => Err(ReconError::Parameter {
-                name: "device".into(),
-                value: format!("{text:?}"),
-                range: "cpu or cuda:N (cuda:0 is the first GPU)".into(),
-            }),
+        let number = |prefix| {
+            let digits: &str = text.strip_prefix(prefix)?;
+            // `parse` would also accept a sign.
+            digits.bytes().all(|byte| byte.is_ascii_digit()).then(|| digits.parse::<i32>().ok())?
+        };
+        let wrong = |range: &'static str| {
+            let value = format!("{text:?}");
+            Err(ReconError::Parameter { name: "device".into(), value, range: range.into() })
+        };
+        match (text, number("gpu:"), number("cuda:")) {
+            ("cpu", ..) => Ok(Self::Cpu),
+            ("gpu", ..) | (_, Some(0), _) => Ok(Self::Gpu),
+            (_, Some(_), _) => wrong(
+                "gpu, because ONNX Runtime takes the first adapter of the Vulkan loader; to use another, start with \
+                 --device gpu and name it in VK_LOADER_DEVICE_SELECT (docs/GPU.md)",
+            ),
+            (.., Some(number)) => Ok(Self::Cuda(number)),
+            _ => wrong("cpu, gpu (a GPU of any vendor) or cuda:N (NVIDIA; cuda:0 is the first)"),
         }
     }
 
@@ -44,7 +59,40 @@ impl Device {
     pub fn provider(self) -> &'static str {
         match self {
             Self::Cpu => "CPUExecutionProvider",
+            Self::Gpu => "WebGpuExecutionProvider",
             Self::Cuda(_) => "CUDAExecutionProvider",
+        }
+    }
+
+    /// Explains a failed pass. Providers report the state of their driver only as text.
+    fn failure(self, name: &str, error: &str) -> ReconError {
+        let lower = error.to_lowercase().replace('_', " ");
+        let mentions = |words: &[&str]| words.iter().any(|word| lower.contains(word));
+        if self == Self::Cpu {
+            ReconError::Runtime(format!("network {name}: {error}"))
+        } else if mentions(&["out of memory", "out of device memory", "failed to allocate"]) {
+            ReconError::Runtime(format!(
+                "the GPU has too little free memory for the network {name}: choose smaller tiles, run fewer workers \
+                 on this GPU, or use --device cpu ({error})"
+            ))
+        } else if mentions(&["device lost", "device is lost", "device was lost", "lost device"])
+            || mentions(&["illegal memory access", "unspecified launch failure"])
+        {
+            ReconError::DeviceLost(format!(
+                "the GPU was lost during a pass of the network {name} ({error})"
+            ))
+        } else {
+            ReconError::Runtime(format!("network {name} on {}: {error}", self.provider()))
+        }
+    }
+}
+
+impl fmt::Display for Device {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Cpu => f.write_str("cpu"),
+            Self::Gpu => f.write_str("gpu"),
+            Self::Cuda(number) => write!(f, "cuda:{number}"),
         }
     }
 }
@@ -117,10 +165,15 @@ impl Runtime {
                 .map_err(text)?
                 .with_config_entry(WEIGHTS_FOLDER, NOWHERE)
                 .map_err(text)?;
-            if let Device::Cuda(number) = self.device {
-                let cuda = CUDA::default().with_device_id(number).build().error_on_failure();
-                builder = builder.with_execution_providers([cuda]).map_err(text)?;
-                builder = builder.with_disable_cpu_fallback().map_err(text)?;
+            let provider = match self.device {
+                Device::Cpu => None,
+                Device::Gpu => Some(WebGPU::default().build()),
+                Device::Cuda(number) => Some(CUDA::default().with_device_id(number).build()),
+            };
+            if let Some(provider) = provider {
+                // Operators on shapes run on the CPU by design, so its provider can't be excluded.
+                let provider = provider.error_on_failure();
+                builder = builder.with_execution_providers([provider]).map_err(text)?;
             }
             builder.commit_from_memory(model).map_err(|error| error.to_string())
         };
@@ -131,6 +184,7 @@ impl Runtime {
 /// A network that maps a clip and a noise level to a clip.
 pub struct ClipNetwork {
     name: String,
+    device: Device,
     session: Session,
 }
 
@@ -147,7 +201,7 @@ impl ClipNetwork {
                 session.outputs().len()
             )));
         }
-        Ok(Self { name: name.to_string(), session })
+        Ok(Self { name: name.to_string(), device: runtime.device, session })
     }
 
     /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes the output for the n middle ones.
@@ -157,8 +211,8 @@ impl ClipNetwork {
         sigma: f32,
         output: &mut [f32],
     ) -> Result<()> {
-        let Self { name, session } = self;
-        let failed = |error: ort::Error| ReconError::Runtime(format!("network {name}: {error}"));
+        let Self { name, device, session } = self;
+        let failed = |error: ort::Error| device.failure(name, &error.to_string());
         let frames = TensorRef::from_array_view(frames).map_err(failed)?;
         let sigma = Tensor::from_array(ndarray::arr0(sigma)).map_err(failed)?;
         let outputs = session.run(ort::inputs![frames, sigma]).map_err(failed)?;
@@ -243,5 +297,47 @@ fn element(element: TensorElementType) -> String {
         TensorElementType::Float32 => "float32".to_owned(),
         TensorElementType::Float64 => "float64".to_owned(),
         other => format!("{other:?}").to_lowercase(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Device;
+    use crate::error::ReconError;
+
+    #[test]
+    fn the_text_of_a_device_is_parsed_and_printed() {
+        for (text, device) in
+            [("cpu", Device::Cpu), ("gpu", Device::Gpu), ("cuda:1", Device::Cuda(1))]
+        {
+            assert_eq!(Device::parse(text).unwrap(), device);
+            assert_eq!(device.to_string(), text);
+        }
+        assert_eq!(Device::parse("gpu:0").unwrap(), Device::Gpu);
+        let huge = format!("cuda:{}", u64::MAX);
+        for text in ["", "GPU", "gpu:", "cuda", "cuda:", "cuda:-1", "cuda:+1", "gpu:x", &huge] {
+            let error = Device::parse(text).unwrap_err().to_string();
+            assert!(error.contains("cpu, gpu"), "{text}: {error}");
+        }
+        let error = Device::parse("gpu:1").unwrap_err().to_string();
+        assert!(error.contains("VK_LOADER_DEVICE_SELECT"), "{error}");
+    }
+
+    #[test]
+    fn a_lost_device_differs_from_a_full_one() {
+        for text in [
+            "A valid external Instance reference no longer exists: Device is lost",
+            "VK_ERROR_DEVICE_LOST",
+        ] {
+            let error = Device::Gpu.failure("n", text);
+            assert!(matches!(error, ReconError::DeviceLost(_)), "{error:?}");
+            assert!(matches!(Device::Cpu.failure("n", text), ReconError::Runtime(_)));
+        }
+        for text in
+            ["VK_ERROR_OUT_OF_DEVICE_MEMORY", "CUDA out of memory", "Failed to allocate buffer"]
+        {
+            let error = Device::Gpu.failure("n", text).to_string();
+            assert!(error.contains("smaller tiles"), "{error}");
+        }
     }
 }

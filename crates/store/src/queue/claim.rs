@@ -81,6 +81,8 @@ pub struct CalibrationTask {
     pub captures: Option<Captures>,
     /// A map of bad pixels, for masks that are made of captures.
     pub bad_pixels: Option<Sha256>,
+    /// True for the masks of a spectral camera, which are one mask, displaced by band.
+    pub spectral: bool,
     /// The masks, a planar array, if they exist.
     pub masks: Option<Sha256>,
 }
@@ -384,11 +386,13 @@ impl Store {
         let request = requests::find(&mut connection, id.into()).await?;
         let masks = sql_as!("SELECT prepared FROM calibrations WHERE id = ?", [id]);
         let masks = masks.fetch_optional(&mut *connection).await?;
-        let (captures, bad_pixels) = match request.submission {
-            Submission::Calibration(request) => (request.captures, request.bad_pixels),
-            Submission::Measurement(_) | Submission::Model(_) => (None, None),
+        let (captures, bad_pixels, spectral) = match request.submission {
+            Submission::Calibration(request) => {
+                (request.captures, request.bad_pixels, request.dispersion.is_some())
+            }
+            Submission::Measurement(_) | Submission::Model(_) => (None, None, false),
         };
-        let task = CalibrationTask { calibration: id, captures, bad_pixels, masks };
+        let task = CalibrationTask { calibration: id, captures, bad_pixels, spectral, masks };
         Ok(Work::Calibration(Box::new(task)))
     }
 }

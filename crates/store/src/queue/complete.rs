@@ -18,8 +18,8 @@ use crate::tables::{models, quota, reports, requests, results, sums};
 use crate::{Store, dir, on_files};
 use engine::intake::Refusal;
 use engine::job::{
-    Assessment, CalibrationId, CalibrationReport, JobId, ModelFacts, ResultFile, Sha256, TaskKind,
-    TaskProgress, TaskState, ThingId, Timestamp, planned_seconds,
+    Assessment, CalibrationId, CalibrationReport, JobId, ModelFacts, Registered, ResultFile,
+    Sha256, TaskKind, TaskProgress, TaskState, ThingId, Timestamp, planned_seconds,
 };
 
 #[derive(Debug)]
@@ -109,6 +109,9 @@ impl Store {
         }
         finish(&mut transaction, lease, &completion.progress, &completion.record, result).await?;
         if let Owner::Job(job) = owner {
+            if kind == TaskKind::Prepare {
+                register(&mut transaction, job, &completion.record).await?;
+            }
             graph::unblock(&mut transaction, job, kind).await?;
             if kind == TaskKind::Manifest {
                 let record = &completion.record;
@@ -230,6 +233,38 @@ impl Store {
         }
         reports::insert(transaction, id, &done.report, done.maps).await
     }
+}
+
+/// Puts the registration of the masks into the job, and its finding among the warnings.
+async fn register(connection: &mut SqliteConnection, job: JobId, record: &Value) -> Result<()> {
+    let Some(registration) = record.get("registration") else { return Ok(()) };
+    let corrupt = |_| StoreError::Corrupt { column: "record", value: registration.to_string() };
+    let Some(registered) = Option::<Registered>::deserialize(registration).map_err(corrupt)? else {
+        return Ok(());
+    };
+    sql!(
+        "UPDATE jobs SET spec = json_set(spec, '$.registered', json(?)) WHERE id = ?",
+        [Json(&registered), job]
+    )
+    .execute(&mut *connection)
+    .await?;
+    if let Some(finding) = registered.finding() {
+        // An earlier attempt may have added it.
+        let superseded = registered.superseded().iter().map(|code| code.as_str());
+        let replaced: Vec<_> = superseded.chain([finding.code.as_str()]).collect();
+        sql!(
+            "UPDATE jobs SET spec = json_set(spec, '$.warnings', (
+                 SELECT json_group_array(json(value)) FROM (
+                     SELECT value FROM json_each(jobs.spec, '$.warnings')
+                     WHERE value ->> 'code' NOT IN (SELECT value FROM json_each(?1))
+                     UNION ALL SELECT ?2 AS value)))
+             WHERE id = ?3",
+            [Json(&replaced), Json(&finding), job]
+        )
+        .execute(&mut *connection)
+        .await?;
+    }
+    Ok(())
 }
 
 async fn finish(

@@ -57,6 +57,14 @@ impl Store {
             .execute(&mut *transaction)
             .await?;
         }
+        if let Some(truth) = changes.truth {
+            sql!(
+                "UPDATE jobs SET truth = ?1, spec = json_set(spec, '$.truth', ?1) WHERE id = ?2",
+                [truth, id]
+            )
+            .execute(&mut *transaction)
+            .await?;
+        }
         transaction.commit().await?;
         Ok(())
     }

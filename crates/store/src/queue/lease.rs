@@ -72,6 +72,8 @@ pub enum WorkerEnd {
     Killed,
     /// The kernel killed it for lack of memory, with this description: the task may be the cause.
     Starved(String),
+    /// It ended because its GPU was lost. The task may be innocent.
+    DeviceLost,
     /// It died of a fault, such as SIGSEGV or a panic: the task is under suspicion.
     Crashed(String),
 }
@@ -214,6 +216,7 @@ impl Store {
         let loss = match end {
             WorkerEnd::Left => Loss::Released,
             WorkerEnd::Killed => Loss::Lost("the worker process was killed".into()),
+            WorkerEnd::DeviceLost => Loss::Lost("the GPU of the worker was lost".into()),
             WorkerEnd::Starved(how) => Loss::Starved(how.clone()),
             WorkerEnd::Crashed(how) => Loss::Crashed(format!("the worker process died: {how}")),
         };

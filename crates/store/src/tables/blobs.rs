@@ -43,7 +43,8 @@ macro_rules! in_use {
           OR EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = h.sha256)
           OR EXISTS (SELECT 1 FROM request_files AS f JOIN requests USING (id)
                      WHERE requests.lab = h.lab AND f.sha256 = h.sha256)
-          OR EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = h.sha256))"
+          OR EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = h.sha256)
+          OR EXISTS (SELECT 1 FROM jobs AS j WHERE j.lab = h.lab AND truth = h.sha256))"
     };
 }
 
@@ -193,6 +194,7 @@ impl Store {
                  AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
                  AND NOT EXISTS (SELECT 1 FROM request_files WHERE sha256 = ?1)
                  AND NOT EXISTS (SELECT 1 FROM models WHERE file = ?1)
+                 AND NOT EXISTS (SELECT 1 FROM jobs WHERE truth = ?1)
                  AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)
              RETURNING created_at",
             [sha256]
@@ -229,6 +231,7 @@ impl Store {
                AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
                AND NOT EXISTS (SELECT 1 FROM request_files AS f WHERE f.sha256 = blobs.sha256)
                AND NOT EXISTS (SELECT 1 FROM models WHERE file = sha256)
+               AND NOT EXISTS (SELECT 1 FROM jobs WHERE truth = sha256)
                AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
              RETURNING sha256, created_at",
             [before]

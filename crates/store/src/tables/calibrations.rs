@@ -10,7 +10,9 @@ use crate::error::{Result, StoreError};
 use crate::rows::{Filter, Page, refuse_if_used};
 use crate::tables::keys::Made;
 use crate::tables::requests::{self, Asked};
-use engine::job::{CalibrationId, Lab, Label, Mosaic, Reading, Sha256, Timestamp, TokenId};
+use engine::job::{
+    CalibrationId, Dispersion, Lab, Label, Mosaic, Reading, Sha256, Timestamp, TokenId,
+};
 
 /// Facts of a calibration whose masks have passed their check.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -35,6 +37,8 @@ pub struct NewCalibration {
     pub mosaic: Option<Mosaic>,
     /// The part of the masks' file that was read; `None` for captures.
     pub reading: Option<Reading>,
+    /// Displacement of the bands of a spectral camera, with which the masks were made of one mask.
+    pub dispersion: Option<Dispersion>,
 }
 
 from_row!(NewCalibration, row => {
@@ -52,6 +56,7 @@ from_row!(NewCalibration, row => {
     clipped_negatives,
     mosaic,
     reading = row.read_json("reading")?,
+    dispersion = row.read_json("dispersion")?,
 });
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -191,8 +196,8 @@ async fn insert(
     let facts = &calibration.facts;
     sql!(
         "INSERT INTO calibrations (lab, token, id, name, masks, prepared, format, sample, axes, frames, height,
-             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at, mosaic, reading)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             width, full_scale, mask_mean, dead_pixels, clipped_negatives, created_at, mosaic, reading, dispersion)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             lab,
             token,
@@ -212,7 +217,8 @@ async fn insert(
             facts.clipped_negatives,
             calibration.created_at,
             facts.mosaic.map(|mosaic| mosaic.to_string()),
-            facts.reading.map(Json)
+            facts.reading.map(Json),
+            facts.dispersion.clone().map(Json)
         ]
     )
     .execute(connection)

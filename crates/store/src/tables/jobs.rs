@@ -7,7 +7,8 @@ use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Page, Span};
 use engine::job::{
-    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Timestamp,
+    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
+    Timestamp,
 };
 
 #[derive(Debug, Clone, PartialEq)]
@@ -57,6 +58,8 @@ pub struct JobChanges {
     /// The new label; `Some(None)` removes it.
     pub label: Option<Option<Label>>,
     pub priority: Option<i32>,
+    /// The upload with the true frames; `Some(None)` removes it.
+    pub truth: Option<Option<Sha256>>,
 }
 
 /// The list of jobs that meet the condition `$whose`, for which there is an index. Identifiers are below 'g', since
@@ -152,8 +155,8 @@ pub async fn insert(
 ) -> Result<()> {
     sql!(
         "INSERT INTO jobs (id, calibration, measurement, label, spec, state, priority,
-             created_at, lab, disk_bytes, model)
-         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+             created_at, lab, disk_bytes, model, truth)
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             id,
             spec.calibration,
@@ -165,7 +168,8 @@ pub async fn insert(
             Timestamp::now(),
             lab,
             spec.disk_bytes(),
-            spec.model.as_ref().map(|model| model.id)
+            spec.model.as_ref().map(|model| model.id),
+            spec.truth
         ]
     )
     .execute(connection)

@@ -219,6 +219,7 @@ impl Store {
             "DELETE FROM lab_totals WHERE lab = ?",
             "DELETE FROM jobs_by_state WHERE lab = ?",
             "DELETE FROM files_of_labs WHERE lab = ?",
+            "DELETE FROM webhook_secrets WHERE lab = ?",
         ] {
             sql!(totals, [lab]).execute(&mut *transaction).await?;
         }

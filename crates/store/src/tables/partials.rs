@@ -20,8 +20,8 @@ pub struct NewPartial {
     pub lab: Lab,
     /// The token against whose limit it counts.
     pub token: Option<TokenId>,
-    /// Bytes of the whole file.
-    pub length: u64,
+    /// Bytes of the whole file; `None` until the client states them.
+    pub length: Option<u64>,
     /// The client's metadata of the file, unchanged.
     pub metadata: String,
     /// The hash that the client says the whole file has.
@@ -50,6 +50,13 @@ from_row!(Partial, row => {
     result,
     expires_at,
 });
+
+impl Partial {
+    /// True if all bytes are received. They may not be stored yet.
+    pub fn is_complete(&self) -> bool {
+        self.facts.length == Some(self.received)
+    }
+}
 
 /// Bytes that are reserved for a new upload. More are reserved as it grows, so that an announcement does not fill the
 /// disk.
@@ -85,7 +92,7 @@ impl PartialFile {
 
     /// True if all bytes are received.
     pub fn is_complete(&self) -> bool {
-        self.upload.received == self.upload.facts.length
+        self.upload.is_complete()
     }
 
     /// Cuts off bytes that were written but not recorded. A file that lacks recorded bytes is refused: extending it
@@ -178,7 +185,7 @@ impl Store {
             return Ok(Inserted::Before(before));
         }
         quota::check_partials(&mut transaction, &facts.lab).await?;
-        quota::check(&mut transaction, &facts.lab, facts.token, facts.length).await?;
+        quota::check(&mut transaction, &facts.lab, facts.token, facts.length.unwrap_or(1)).await?;
         sql!(
             "INSERT INTO partials (id, lab, token, length, metadata, expected, expires_at)
              VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -259,7 +266,28 @@ impl Store {
         .await
     }
 
-    /// Records that `bytes` more are on the disk, and puts off the end.
+    /// Records the length of an upload that began without one.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if it was deleted.
+    pub async fn set_partial_length(&self, partial: &mut PartialFile, length: u64) -> Result<()> {
+        let Partial { id, facts, received, .. } = &mut partial.upload;
+        let mut transaction = self.write().await?;
+        let more = length.saturating_sub(*received);
+        quota::check(&mut transaction, &facts.lab, facts.token, more).await?;
+        let changed =
+            sql!("UPDATE partials SET length = ? WHERE id = ? AND length IS NULL", [length, *id])
+                .execute(&mut *transaction)
+                .await?;
+        if changed.rows_affected() == 0 {
+            return Err(StoreError::missing("upload", *id));
+        }
+        transaction.commit().await?;
+        facts.length = Some(length);
+        Ok(())
+    }
+
+    /// Records that `bytes` more are on the disk, and puts off the end. A known length was counted against the quotas when
+    /// it was stated; without one, the bytes are.
+    /// Errors: [`StoreError::Quota`]; [`StoreError::NotFound`] if it was deleted.
     pub async fn advance_partial(
         &self,
         partial: &mut PartialFile,
@@ -268,15 +296,21 @@ impl Store {
     ) -> Result<()> {
         let upload = &mut partial.upload;
         let (received, expires_at) = (upload.received + bytes, after(age));
+        let mut transaction = self.write().await?;
+        if upload.facts.length.is_none() {
+            let facts = &upload.facts;
+            quota::check(&mut transaction, &facts.lab, facts.token, bytes).await?;
+        }
         let changed = sql!(
             "UPDATE partials SET received = ?, expires_at = ? WHERE id = ? AND received = ?",
             [received, expires_at, upload.id, upload.received]
         )
-        .execute(self.writer()?)
+        .execute(&mut *transaction)
         .await?;
         if changed.rows_affected() == 0 {
             return Err(StoreError::missing("upload", upload.id));
         }
+        transaction.commit().await?;
         (upload.received, upload.expires_at) = (received, expires_at);
         Ok(())
     }
@@ -292,7 +326,7 @@ impl Store {
         let (store, original) = (self.clone(), path.clone());
         // Under a second name, so that the bytes are not lost if the rest fails.
         let staged = on_files(move || store.staged_link(&original, lock)?.finish()).await?;
-        if staged.size() != upload.facts.length {
+        if Some(staged.size()) != upload.facts.length {
             return Err(short(&upload, staged.size()));
         }
         let found = staged.sha256();

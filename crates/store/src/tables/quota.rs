@@ -64,7 +64,8 @@ async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Resul
     sql_as!(
         "SELECT (SELECT coalesce(sum(size), 0) FROM holdings JOIN blobs USING (sha256)
                  WHERE token = ?1)
-              + (SELECT coalesce(sum(length), 0) FROM partials WHERE token = ?1 AND result IS NULL)
+              + (SELECT coalesce(sum(coalesce(length, received)), 0) FROM partials
+                 WHERE token = ?1 AND result IS NULL)
               + (SELECT coalesce(sum(size), 0) FROM blobs
                  WHERE sha256 IN (SELECT prepared FROM calibrations WHERE token = ?1
                                   UNION SELECT prepared FROM measurements WHERE token = ?1))
@@ -80,7 +81,8 @@ async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Resul
 async fn lab_bytes(connection: &mut SqliteConnection, lab: &Lab) -> Result<u64> {
     sql_as!(
         "SELECT (SELECT coalesce(sum(bytes), 0) FROM files_of_labs WHERE lab = ?1)
-              + (SELECT coalesce(sum(length), 0) FROM partials WHERE lab = ?1 AND result IS NULL)
+              + (SELECT coalesce(sum(coalesce(length, received)), 0) FROM partials
+                 WHERE lab = ?1 AND result IS NULL)
               + (SELECT coalesce(sum(prepared_bytes), 0) FROM requests
                  WHERE lab = ?1 AND prepared_bytes > 0)
               + (SELECT coalesce(sum(iif(state IN ('queued', 'running', 'cancelling'),
@@ -132,6 +134,11 @@ pub async fn check_partials(connection: &mut SqliteConnection, lab: &Lab) -> Res
 pub async fn check_checks(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
     let open = "SELECT count(*) FROM tasks
                 WHERE lab = ? AND kind = 'check' AND state IN ('ready', 'running')";
-    let open: u64 = sql_as!(open, [lab]).fetch_one(connection).await?;
-    if open < MOST_CHECKS { Ok(()) } else { Err(StoreError::ManyChecks(open)) }
+    let checks: u64 = sql_as!(open, [lab]).fetch_one(&mut *connection).await?;
+    if checks < MOST_CHECKS {
+        return Ok(());
+    }
+    let mean = "SELECT seconds / tasks FROM totals WHERE kind = 'check' AND tasks > 0";
+    let mean_seconds = sql_as!(mean).fetch_optional(connection).await?;
+    Err(StoreError::ManyChecks { checks, mean_seconds })
 }

@@ -48,7 +48,7 @@ impl Store {
 pub async fn reservations(connection: &mut SqliteConnection) -> Result<Reservations> {
     let found: Vec<(Lab, f64)> = sql_as!(
         "SELECT lab, sum(bytes) FROM (
-             SELECT lab, min(length - received, max(received, ?2)) AS bytes
+             SELECT lab, min(coalesce(length - received, max(received, ?2)), max(received, ?2)) AS bytes
              FROM partials WHERE result IS NULL
              UNION ALL
              SELECT lab, prepared_bytes * iif(request ->> '$.captures' IS NULL, 1, 2)

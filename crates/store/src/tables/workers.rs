@@ -34,12 +34,12 @@ pub enum WorkerTakes {
     ShortTasks,
 }
 
-/// Where a worker is that came over the network; empty for one of this machine.
+/// The machine and device of a worker. Host and pool are empty for a worker of this machine.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct WorkerPlace {
     pub host: Option<String>,
     pub pool: Option<String>,
-    /// Device: cpu, or cuda:0.
+    /// Device of its networks: cpu, gpu or cuda:N.
     pub device: Option<String>,
 }
 

@@ -86,6 +86,7 @@ impl Lab {
             clipped_negatives: 0,
             mosaic: None,
             reading: None,
+            dispersion: None,
         };
         let done = CalibrationDone { masks: Some((facts, masks)), ..report() };
         let completion = Completion {

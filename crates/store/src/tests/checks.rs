@@ -96,12 +96,17 @@ async fn a_lab_has_so_many_checks_and_no_more() {
     let asked = CalibrationRequest { masks, ..CalibrationRequest::default() };
     let asked = new_request(Submission::Calibration(asked));
     let refused = lab.store.request::<CalibrationId>((&named("first"), None), &asked, None).await;
-    assert!(matches!(refused, Err(StoreError::ManyChecks(32))));
+    assert!(matches!(refused, Err(StoreError::ManyChecks { checks: 32, .. })));
     lab.ask("second", None).await;
     let task = lab.claim().await.unwrap();
     let refusal = Refusal::new(RefusalCode::InvalidContent, "no light");
     checked(&lab.store, &task, Checked::Refused(refusal)).await;
     lab.ask("first", None).await;
+    let refused = lab.store.request::<CalibrationId>((&named("first"), None), &asked, None).await;
+    let Err(StoreError::ManyChecks { mean_seconds: Some(seconds), .. }) = refused else {
+        panic!("{refused:?}")
+    };
+    assert!((0.0..60.0).contains(&seconds), "{seconds}");
 }
 
 #[tokio::test]

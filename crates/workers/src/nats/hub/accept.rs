@@ -115,7 +115,11 @@ impl Core {
         };
         let task = tile_task(job, snapshot, tile)?;
         let path = |sha256: Sha256| (self.store.dir().blob(&sha256), sha256);
-        let arrays = Arrays { masks: path(task.masks), snapshots: path(task.measurement) };
+        let arrays = Arrays {
+            masks: path(task.masks),
+            snapshots: path(task.measurement),
+            shift: task.shift,
+        };
         let known = tokio::task::spawn_blocking(move || {
             let masks = Reader::open(&arrays.masks.0, &Limits::default())?;
             let mut info = *masks.info();

@@ -11,6 +11,7 @@ use super::replays::Replays;
 use crate::nats::connection::Connection;
 use crate::nats::message::{Input, Notice, Program};
 use crate::nats::names;
+use crate::transport::TileTask;
 use engine::job::{JobId, Pool, Sha256, TaskId, WorkerId};
 use reconstruction::tile::Tile;
 use store::Store;
@@ -33,6 +34,22 @@ pub struct Undelivered {
     pub since: Instant,
     /// True if the consumer was recreated in the meantime.
     pub consumer_recreated: bool,
+}
+
+/// A window of prepared masks, which may be moved.
+#[derive(PartialEq, Eq, Hash)]
+struct MaskWindow {
+    masks: Sha256,
+    /// The bits of the shift.
+    shift: Option<[u64; 2]>,
+    tile: Tile,
+}
+
+impl MaskWindow {
+    fn of(task: &TileTask) -> Self {
+        let shift = task.shift.map(|shift| shift.map(f64::to_bits));
+        Self { masks: task.masks, shift, tile: task.tile }
+    }
 }
 
 /// State that the parts of the hub share.
@@ -61,7 +78,7 @@ pub struct Core {
     /// Inputs in the stream, and when they were sent.
     put: Mutex<HashMap<(Pool, Sha256), Instant>>,
     /// Hashes and sizes of windows of prepared masks.
-    windows: Mutex<HashMap<(Sha256, Tile), Input>>,
+    windows: Mutex<HashMap<MaskWindow, Input>>,
     /// Tiles that wait although workers of their pool wait too; see `sweep.rs`.
     pub undelivered: Mutex<HashMap<TaskId, Undelivered>>,
     /// Messages that belonged to no tile at the last sweep.
@@ -128,16 +145,16 @@ impl Core {
     }
 
     /// Hash and size of a window of prepared masks, if they are known.
-    pub fn window(&self, masks: Sha256, tile: Tile) -> Option<Input> {
-        lock(&self.windows).get(&(masks, tile)).copied()
+    pub fn window(&self, task: &TileTask) -> Option<Input> {
+        lock(&self.windows).get(&MaskWindow::of(task)).copied()
     }
 
-    pub fn note_window(&self, masks: Sha256, tile: Tile, input: Input) {
+    pub fn note_window(&self, task: &TileTask, input: Input) {
         let mut windows = lock(&self.windows);
         if windows.len() >= MAX_WINDOWS {
             windows.clear();
         }
-        windows.insert((masks, tile), input);
+        windows.insert(MaskWindow::of(task), input);
     }
 
     pub fn note_snapshots(&self, task: TaskId, pool: &Pool, sha256: Sha256) {

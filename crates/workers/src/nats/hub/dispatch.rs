@@ -16,7 +16,7 @@ use crate::nats::{arrays, names};
 use crate::transport::TileTask;
 use engine::job::{Pool, Sha256, TaskKind, without_paths};
 use engine::pipeline::PipelineError;
-use engine::pipeline::arrays::window;
+use engine::pipeline::arrays::{mask_window, snapshot_window};
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use store::{Claimant, ClaimedTask, MessagePlace, RemoteTask, StoreError, Work};
@@ -156,11 +156,11 @@ impl Core {
             return Err(wrong().into());
         };
         let tile = tile_task(job, snapshot, tile)?;
-        let masks = match self.window(tile.masks, tile.tile) {
+        let masks = match self.window(&tile) {
             Some(known) if self.is_put(pool, known.sha256) => known,
             _ => {
                 let input = self.put_input(pool, self.cut(&tile, Part::Masks).await?).await?;
-                self.note_window(tile.masks, tile.tile, input);
+                self.note_window(&tile, input);
                 input
             }
         };
@@ -181,11 +181,13 @@ impl Core {
         let (path, task) = (self.store.dir().blob(&sha256), task.clone());
         let cut = tokio::task::spawn_blocking(move || {
             let array = Reader::open(&path, &Limits::default())?;
-            let frames = match part {
-                Part::Masks => 0..array.info().frames,
-                Part::Snapshots => task.snapshots.start as usize..task.snapshots.end as usize,
+            let place = task.tile.window();
+            let frames = task.snapshots.start as usize..task.snapshots.end as usize;
+            let window = match part {
+                Part::Masks => mask_window(&array, &place, task.shift),
+                Part::Snapshots => snapshot_window(&array, frames, &place, task.shift),
             };
-            arrays::to_bytes(window(&array, frames, &task.tile.window())?.view())
+            arrays::to_bytes(window?.view())
         });
         Ok(cut.await.map_err(|_| PipelineError::Thread)??)
     }

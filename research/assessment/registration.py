@@ -1,0 +1,210 @@
+"""Test whether masks that moved since their calibration are found and corrected, and whether others are left alone.
+
+    python registration.py run SCI_RECON_BINARY --data DATA --out FOLDER [--cases 40] [--first 0] [--algorithm gap-tv]
+    python registration.py report --out FOLDER [--markdown]
+
+DATA has photographs in photos/train and photos/val. A camera moves over them behind masks of four kinds, Cr 8 to 20, with
+noise of 0 to 10. Binary masks move as areas of a pattern with eight times the resolution, blurred or not. Masks of the
+optics move by the Fourier shift theorem. The program interpolates in other ways. Each case is reconstructed with the
+masks of the calibration, registered ones and the true ones. Right masks and flipped ones must be left alone. `run` appends a line to a
+file in FOLDER for this binary: an interrupted run continues where it stopped. The last line of a report is JSON.
+"""
+import argparse
+import concurrent.futures
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import cv2
+import numpy as np
+
+from wrong_inputs import Runs, panned, read
+
+KINDS = 'iid', 'iid-blurred', 'random-squares', 'rotating-circle'
+RATIOS = 8, 10, 12, 16, 20
+SIGMAS = 0, 2, 5, 10
+STEPS = 0, .3, 1, 2
+REACH = 4       # pixels
+FINE = 8        # cells of a pixel
+BORDER = 16     # pixels around a picture, into which masks move
+WORSE = .1      # dB that an unnecessary correction may cost
+
+
+# ---------------------------------------------------------------- cases
+def areas(pattern, cells, blur, side):
+    """Masks [B,side,side] from a pattern [B,n,n] that moved down and to the right by cells, and that a lens blurs."""
+    def mask(frame):
+        fine = np.kron(frame, np.ones((FINE, FINE), np.float32))
+        fine = cv2.GaussianBlur(fine, (0, 0), blur * FINE) if blur else fine
+        rows, columns = (BORDER * FINE - cell for cell in cells)
+        return fine[rows:rows + side * FINE, columns:columns + side * FINE].reshape(side, FINE, side, FINE).mean((1, 3))
+    return np.stack([mask(frame) for frame in pattern])
+
+
+def fourier(masks, shift, side):
+    """The middle of masks [B,n,n] after a shift down and to the right, clipped to [0,1]."""
+    rows, columns = (np.fft.fftfreq(length) for length in masks.shape[1:])
+    phase = np.exp(-2j * np.pi * (rows[:, None] * shift[0] + columns * shift[1]))
+    moved = np.fft.ifft2(np.fft.fft2(masks) * phase).real.clip(0, 1)
+    return moved[:, BORDER:BORDER + side, BORDER:BORDER + side].astype(np.float32)
+
+
+class Case:
+    def __init__(self, binary, files, index, side):
+        rng = np.random.default_rng([11, index])
+        self.kind, self.ratio, self.sigma = KINDS[index % 4], int(rng.choice(RATIOS)), float(SIGMAS[index // 4 % 4])
+        self.step, self.blur, scale = float(rng.choice(STEPS)), 0, float(rng.choice([.3, .5, .8]))
+        # A third of the shifts is shorter than a pixel.
+        reach = 1 if index // 4 % 3 == 1 else REACH
+        cells = rng.integers(-reach * FINE, reach * FINE + 1, 2)
+        cells[0] = cells[0] or 3
+        self.shift, file = (cells / FINE).tolist(), files[index % len(files)]
+        photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE)
+        self.photo, self.frames = pathlib.Path(file).stem, panned(photo, self.ratio, side, self.step, scale).astype(np.float32)
+        wide = side + 2 * BORDER
+        if self.kind.startswith('iid'):
+            self.blur = float(rng.uniform(.6, .8)) if self.kind == 'iid-blurred' else 0
+            pattern = (rng.random((self.ratio, wide, wide)) < .5).astype(np.float32)
+            self.calibrated, self.moved = (areas(pattern, cells, self.blur, side) for cells in ([0, 0], cells))
+        else:
+            masks = simulated(binary, self.kind, self.ratio, wide, index)
+            self.calibrated, self.moved = (fourier(masks, shift, side) for shift in ([0, 0], self.shift))
+        self.noise = (self.sigma / 255 * rng.standard_normal((side, side))).astype(np.float32)
+
+    def about(self):
+        return {'kind': self.kind, 'ratio': self.ratio, 'sigma': self.sigma, 'shift': self.shift, 'blur': self.blur, 'step': self.step, 'photo': self.photo[:30]}
+
+
+def simulated(binary, kind, ratio, side, seed):
+    """Masks [B,side,side] of the optics."""
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        np.save(folder / 'scene.npy', np.full((ratio, side, side), .5, np.float32))
+        subprocess.run([binary, 'simulate', '--frames', folder / 'scene.npy', '--compression-ratio', str(ratio), '--pattern', kind,
+                        '--seed', str(seed), '--out', folder / 'out'], check=True, stdout=subprocess.DEVNULL)
+        return np.load(folder / 'out/masks.npy')
+
+
+# ---------------------------------------------------------------- runs
+class Bench(Runs):
+    def __init__(self, a):
+        super().__init__(a, lambda row: row['case'])
+
+    def case(self, index):
+        if index in self.done:
+            return
+        case = Case(self.a.binary, self.files, index, self.a.side)
+        runs = {}
+        for drift, true in (('drift', case.moved), ('none', case.calibrated)):
+            y = (true * case.frames).sum(0) + case.noise
+            arms = [('calibrated', case.calibrated, 'off'), ('registered', case.calibrated, 'auto')]
+            arms += [('true', true, 'off')] if drift == 'drift' else []
+            if drift == 'none':
+                arms += [('flipped', case.calibrated[:, :, ::-1], 'off'), ('flipped_registered', case.calibrated[:, :, ::-1], 'auto')]
+            runs[drift] = {name: self.reconstruct(masks, y, case.frames, option) for name, masks, option in arms}
+        self.keep({'case': index} | case.about() | runs)
+
+    def reconstruct(self, masks, y, truth, option):
+        with tempfile.TemporaryDirectory() as folder:
+            folder = pathlib.Path(folder)
+            for name, array in {'masks': masks, 'measurement': y / len(masks), 'truth': truth}.items():
+                np.save(folder / f'{name}.npy', array.astype(np.float32))
+            done = subprocess.run([self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
+                                   '--truth-full-scale', '1', '--measurement-full-scale', str(1 / len(masks)), '--algorithm', self.a.algorithm, '--registration', option,
+                                   '--threads', '1', '--json', '--out', folder / 'out'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            if done.returncode not in (0, 3):
+                sys.exit(f'a reconstruction failed: {done.stderr}')
+            report, manifest = json.loads(done.stdout), json.loads((folder / 'out/manifest.json').read_text())
+        return {'psnr_db': report['psnr_unit_db'], 'cpu_s': report['cpu_seconds'], 'registration': manifest['content'].get('registration')}
+
+
+def run(a):
+    bench = Bench(a)
+    with concurrent.futures.ThreadPoolExecutor(a.parallel) as pool:
+        for future in [pool.submit(bench.case, index) for index in range(a.first, a.first + a.cases)]:
+            future.result()
+    report(a)
+
+
+# ---------------------------------------------------------------- report
+def error(row):
+    """Distance in pixels of the estimate from the true shift; `None` if no correction was applied."""
+    found = row['drift']['registered']['registration']
+    return float(np.hypot(*np.subtract(found['shift'], row['shift']))) if found['applied'] else None
+
+
+def limit(row):
+    """Largest acceptable error of the shift in pixels."""
+    fine = .05 if row['sigma'] <= 5 and row['ratio'] <= 10 else .1
+    return fine + .05 if row['kind'] == 'rotating-circle' else fine
+
+
+def gain(arms, one='registered', other='calibrated'):
+    return arms[one]['psnr_db'] - arms[other]['psnr_db']
+
+
+def median(values):
+    return round(float(np.median(values)), 2) if len(values) else None
+
+
+def summary(rows):
+    errors = [error(row) for row in rows]
+    applied = [(row, error) for row, error in zip(rows, errors) if error is not None]
+    psnr = lambda name: median([row['drift'][name]['psnr_db'] for row in rows])
+    return {'cases': len(rows), 'applied': len(applied), 'within_limit': sum(error <= limit(row) for row, error in applied),
+            'within_0_05': sum(error <= .05 for _, error in applied), 'within_0_1': sum(error <= .1 for _, error in applied),
+            'calibrated_db': psnr('calibrated'), 'registered_db': psnr('registered'), 'true_db': psnr('true'),
+            'lost_to_true_db': median([gain(row['drift'], 'true', 'registered') for row, _ in applied]),
+            'made_worse': sum(gain(row[drift]) < -WORSE for row in rows for drift in ('drift', 'none'))
+                          + sum(gain(row['none'], 'flipped_registered', 'flipped') < -WORSE for row in rows),
+            'false_corrections': [sum(row['none'][arm]['registration']['applied'] for row in rows) for arm in ('registered', 'flipped_registered')]}
+
+
+def report(a):
+    rows = sorted(read(a.out), key=lambda row: row['case'])
+    table = {kind: summary([row for row in rows if row['kind'] == kind]) for kind in KINDS if any(row['kind'] == kind for row in rows)}
+    table['all'] = summary(rows)
+    if not a.markdown:
+        for row in rows:
+            found, still = row['drift']['registered']['registration'], row['none']['registered']['registration']
+            off = error(row)
+            psnr = ' '.join(f'{row["drift"][name]["psnr_db"]:.2f}' for name in ('calibrated', 'registered', 'true'))
+            print(f'{row["case"]:3} {row["kind"]:15} Cr {row["ratio"]:2} sigma {row["sigma"]:g} shift {row["shift"]} found {np.round(found["shift"], 3).tolist()} '
+                  f'{"not applied" if off is None else f"off by {off:.3f}"}{"" if off is None or off <= limit(row) else " !"} dB {psnr} {(found["reason"] or "")[:40]}; '
+                  f'no drift: {np.round(still["shift"], 3).tolist()} {"APPLIED" if still["applied"] else "left"} {gain(row["none"]):+.2f}; '
+                  f'flipped: {"APPLIED" if row["none"]["flipped_registered"]["registration"]["applied"] else "left"}')
+        print()
+    print('| masks | corrected | within the limit | within 0.05 and 0.1 pixels | calibrated, registered, true masks, dB | below true masks, dB | corrections of right masks, of flipped ones | made worse |')
+    print('| --- | --- | --- | --- | --- | --- | --- | --- |')
+    for kind, one in table.items():
+        print(f'| {kind} | {one["applied"]} of {one["cases"]} | {one["within_limit"]} | {one["within_0_05"]}, {one["within_0_1"]} | {one["calibrated_db"]}, {one["registered_db"]}, {one["true_db"]}'
+              f' | {one["lost_to_true_db"]} | {", ".join(map(str, one["false_corrections"]))} | {one["made_worse"]} |')
+    cost = [row[drift]['registered']['cpu_s'] - row[drift]['calibrated']['cpu_s'] for row in rows for drift in ('drift', 'none')]
+    per_frame = [seconds / row['ratio'] for seconds, row in zip(cost, [row for row in rows for _ in range(2)])]
+    print()
+    print(json.dumps(table | {'cpu_s_per_frame': median(per_frame), 'largest_cpu_s': round(max(cost), 2)}))
+
+
+def main():
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = p.add_subparsers(dest='what', required=True)
+    runs = commands.add_parser('run')
+    runs.add_argument('binary', metavar='SCI_RECON_BINARY', type=os.path.abspath)
+    runs.add_argument('--data', required=True)
+    runs.add_argument('--cases', type=int, default=40)
+    runs.add_argument('--first', type=int, default=0, help='number of the first case; use others than the first 40 for tuning')
+    runs.add_argument('--algorithm', default='gap-tv')
+    runs.add_argument('--side', type=int, default=128, help='side of the images in pixels')
+    runs.add_argument('--parallel', type=int, default=os.cpu_count(), help='reconstructions at the same time')
+    for command in (runs, commands.add_parser('report')):
+        command.add_argument('--out', required=True, help='the folder of the results')
+        command.add_argument('--markdown', action='store_true', help='print the table alone')
+    a = p.parse_args()
+    {'run': run, 'report': report}[a.what](a)
+
+
+if __name__ == '__main__':
+    main()

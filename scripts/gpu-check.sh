@@ -1,0 +1,143 @@
+#!/usr/bin/env bash
+# Check a GPU against the CPU and measure its speed. Needs bash and Python 3 without packages, and no network.
+#
+#   scripts/gpu-check.sh [--device gpu] [--sizes 256,512,1024] [--program FILE] [--library FILE] [--seconds 480]
+#
+# Three small scenes are reconstructed on both devices with the same networks. Then networks and default jobs are timed at
+# each size. Progress goes to standard error, one JSON object to standard output. Exit status: 0 if the results agree.
+# In a folder that scripts/gpu-pack.sh packed, it uses the program, library and Vulkan loader of that folder.
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+export LD_LIBRARY_PATH="$here/vulkan${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
+if [ -e "$here/libonnxruntime.so.xz" ] && [ ! -e "$here/libonnxruntime.so" ]; then
+  python3 -c 'import lzma, shutil, sys; shutil.copyfileobj(lzma.open(sys.argv[1]), open(sys.argv[2], "wb"))' \
+    "$here/libonnxruntime.so.xz" "$here/libonnxruntime.so"
+fi
+exec python3 - "$here" "$@" <<'PY'
+import argparse, array, json, math, os, random, struct, subprocess, sys, tempfile, time
+
+here = sys.argv[1]
+parser = argparse.ArgumentParser(prog='gpu-check.sh')
+parser.add_argument('--device', default='gpu')
+parser.add_argument('--sizes', default='256,512,1024')
+packed = os.path.exists(here + '/sci-recon')
+parser.add_argument('--program', default=here + '/sci-recon' if packed else here + '/../target/release/sci-recon')
+parser.add_argument('--library', default=here + ('/libonnxruntime.so' if packed else '/../runtime-gpu/libonnxruntime.so'))
+parser.add_argument('--seconds', type=float, default=480)
+options = parser.parse_args(sys.argv[2:])
+end = time.monotonic() + options.seconds
+FRAMES, SMALL, TOLERANCE = 8, 64, 1e-4
+report = {'device': options.device, 'scenes': {}, 'speed': {}, 'skipped': []}
+
+
+def program(*arguments):
+    """Output of a command as JSON, or an exception with its message."""
+    left = end - time.monotonic()
+    if left < 5:
+        raise TimeoutError
+    try:
+        done = subprocess.run([options.program, *map(str, arguments)], capture_output=True, text=True, timeout=left)
+    except subprocess.TimeoutExpired:
+        raise TimeoutError from None
+    if not done.stdout.lstrip().startswith('{'):
+        raise RuntimeError(f'{arguments[0]}: {done.stderr.strip()[-2000:]}')
+    return json.loads(done.stdout)
+
+
+def save(path, shape, values):
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {tuple(shape)}, }}"
+    header += ' ' * (63 - (10 + len(header)) % 64) + '\n'
+    with open(path, 'wb') as file:
+        file.write(b'\x93NUMPY\x01\x00' + struct.pack('<H', len(header)) + header.encode())
+        file.write(array.array('f', values).tobytes())
+
+
+def load(path):
+    with open(path, 'rb') as file:
+        start = file.read(10)
+        file.read(struct.unpack('<H', start[8:])[0])
+        values = array.array('f')
+        values.frombytes(file.read())
+    return values
+
+
+def scene(name, k, i, j):
+    """Brightness of a pixel of frame k."""
+    if name == 'grating':
+        return .5 + .4 * math.sin((i + 2 * j) / 5 + k / 2)
+    if name == 'disc':
+        return .9 if math.hypot(i - 20 - 3 * k, j - 24 - 2 * k) < 10 else .1
+    return (.2 + .6 * ((i // 8 + j // 8) % 2)) * (1 - .05 * k)
+
+
+def inputs(folder, name, size):
+    """Masks and a measurement of a scene that repeats every SMALL pixels."""
+    os.makedirs(folder, exist_ok=True)
+    masks, sums = array.array('f'), array.array('f', bytes(4 * size * size))
+    source = random.Random(1)
+    for k in range(FRAMES):
+        mask = array.array('f', map(float, bin(source.getrandbits(size * size) | 1 << size * size)[3:]))
+        masks.extend(mask)
+        rows = [array.array('f', [scene(name, k, i, j) for j in range(SMALL)]) * (size // SMALL) for i in range(SMALL)]
+        for at, open_ in enumerate(mask):
+            if open_:
+                sums[at] += rows[at // size % SMALL][at % size]
+    save(folder + '/masks.npy', (FRAMES, size, size), masks)
+    save(folder + '/measurement.npy', (1, size, size), sums)
+
+
+def reconstruct(folder, device, schedule=None):
+    """Report and frames of a reconstruction."""
+    line = ['reconstruct', '--masks', folder + '/masks.npy', '--measurement', folder + '/measurement.npy', '--json',
+            '--onnxruntime', options.library, '--device', device, '--out', folder + '/' + device]
+    if schedule:
+        with open(folder + '/schedule.json', 'w') as file:
+            json.dump({'adaptive': False, 'stages': schedule}, file)
+        line += ['--schedule', folder + '/schedule.json']
+    return program(*line), folder + '/' + device + '/frames.npy'
+
+
+def stages(passes):
+    return [{'prior': 'tv', 'iterations': 4, 'tv_weight': .15, 'tolerance': 0},
+            {'prior': 'fastdvdnet', 'iterations': passes, 'sigma': [.1, .05], 'tolerance': 0}]
+
+
+def step(name, action):
+    print(f'gpu-check: {name}, {end - time.monotonic():.0f} s left', file=sys.stderr)
+    try:
+        return action()
+    except TimeoutError:
+        report['skipped'].append(name)
+
+
+def compare(folder, name):
+    inputs(folder, name, SMALL)
+    frames = [load(reconstruct(folder, device, stages(2))[1]) for device in ('cpu', options.device)]
+    same = len(frames[0]) == len(frames[1])
+    largest = max(abs(a - b) for a, b in zip(*frames))
+    report['scenes'][name] = {'max_difference': largest, 'agrees': same and largest <= TOLERANCE}
+
+
+def measure(folder, size):
+    inputs(folder, 'grating', size)
+    voxels = FRAMES * size * size / 1e6
+    few, many = (reconstruct(folder, options.device, stages(passes))[0]['seconds'] for passes in (2, 10))
+    report['speed'][size] = {'network_mvoxel_per_s': round(8 * voxels / (many - few), 4) if many > few else None}
+    whole = reconstruct(folder, options.device)[0]
+    report['speed'][size] |= {'job_seconds': whole['seconds'], 'job_cpu_seconds': whole['cpu_seconds'],
+                              'job_mvoxel_per_s': round(voxels / whole['seconds'], 4)}
+
+
+with tempfile.TemporaryDirectory() as folder:
+    try:
+        report['devices'] = step('devices', lambda: program('devices', '--json', '--onnxruntime', options.library))
+        for name in ('grating', 'disc', 'squares'):
+            step(f'scene {name}', lambda: compare(f'{folder}/{name}', name))
+        for size in map(int, options.sizes.split(',')):
+            step(f'size {size}', lambda: measure(f'{folder}/{size}', size))
+    except RuntimeError as error:
+        report['error'] = str(error)
+report['agrees'] = len(report['scenes']) == 3 and all(scene['agrees'] for scene in report['scenes'].values())
+print(json.dumps(report))
+sys.exit(0 if report['agrees'] and 'error' not in report else 1)
+PY

@@ -1,0 +1,45 @@
+//! `/docs`: the contract as a page, rendered by Redoc.
+//!
+//! Redoc 2 has half the size of Redoc 3, and a quarter of that of Scalar. `scripts/vendor-redoc.sh` fetches it.
+
+use std::sync::LazyLock;
+
+use axum::http::HeaderMap;
+use axum::response::Response;
+
+use super::asset::Asset;
+use super::error::{ApiError, Code, Result};
+use super::extract::Params;
+
+/// Content security policy of this page. Redoc adds style elements, draws icons from data, and searches in a worker that it
+/// creates from a blob.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; img-src 'self' data:; \
+     worker-src blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+static PAGE: LazyLock<Asset> = LazyLock::new(|| {
+    Asset::new("text/html; charset=utf-8", include_bytes!("index.html").as_slice())
+});
+
+static FILES: LazyLock<[(&str, Asset); 3]> = LazyLock::new(|| {
+    let script = "text/javascript; charset=utf-8";
+    let licence = include_bytes!("LICENSE.txt").as_slice();
+    [
+        ("start.js", Asset::new(script, include_bytes!("start.js").as_slice())),
+        ("redoc.js", Asset::packed(script, include_bytes!("redoc.js.gz"))),
+        ("LICENSE.txt", Asset::new("text/plain; charset=utf-8", licence)),
+    ]
+});
+
+pub(super) async fn page(headers: HeaderMap) -> Result<Response> {
+    PAGE.page(&headers, POLICY)
+}
+
+pub(super) async fn file(Params(name): Params<String>, headers: HeaderMap) -> Result<Response> {
+    let file = FILES.iter().find(|(known, _)| *known == name).ok_or_else(|| {
+        ApiError::new(
+            Code::NotFound,
+            "the reference has no file with this name; open /docs instead",
+        )
+    })?;
+    file.1.page(&headers, POLICY)
+}

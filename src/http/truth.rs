@@ -1,0 +1,55 @@
+//! True frames that a lab uploaded for a job.
+
+use std::path::Path;
+
+use super::app::App;
+use super::error::{ApiError, Code, Result};
+use super::intake;
+use engine::intake::{Opened, Source};
+use engine::job::{Lab, SceneShape, Sha256};
+use formats::mat::SceneArray;
+use formats::{Axes, Channels, Limits};
+
+/// Checks that an upload can be the true frames of a job with this shape.
+///
+/// Errors: those of the file, at `/truth`.
+pub(super) async fn check(app: &App, lab: &Lab, truth: Sha256, shape: SceneShape) -> Result<()> {
+    let found = app.store.upload(lab, truth).await;
+    found.map_err(|error| ApiError::reference("/truth", error))?;
+    let upload = intake::upload(app, truth).await.map_err(|error| error.at("/truth"))?;
+    let limits = app.limits;
+    let opened =
+        intake::run(app, lab, move || open(&upload, (None, None), limits, shape).map(drop)).await;
+    opened.map_err(|error| error.at("/truth"))
+}
+
+/// Opens true frames, of one snapshot or of all, and checks their number and size. The truth of a colour sensor may have
+/// colours, or one colour for each pixel, as the sensor records it.
+pub(super) fn open(
+    path: &Path,
+    (full_scale, axes): (Option<f32>, Option<Axes>),
+    limits: Limits,
+    shape: SceneShape,
+) -> Result<(Opened, Channels)> {
+    let source = Source::upload(path, SceneArray::Truth, full_scale, limits);
+    let colours = if shape.mosaic.is_some() { source.open_colours()? } else { None };
+    let (truth, channels) = match colours {
+        Some(colours) => (colours, Channels::Rgb),
+        None => {
+            let source = source.arranged(axes, Some((shape.height, shape.width)));
+            (source.open()?, Channels::Grey)
+        }
+    };
+    let SceneShape { frames, height, width, snapshots, .. } = shape;
+    let (all, info) = (frames * snapshots as usize, &truth.info);
+    let (rows, columns) = (info.height, info.width / channels.count());
+    if (rows, columns) == (height, width) && [frames, all].contains(&info.frames) {
+        return Ok((truth, channels));
+    }
+    let detail = format!(
+        "the truth has {} frames of {rows}x{columns}; it should have {frames} of {height}x{width} for one \
+         snapshot, or {all} for all",
+        info.frames
+    );
+    Err(ApiError::new(Code::SizeMismatch, detail))
+}

@@ -1,0 +1,187 @@
+//! Notifications of webhooks: when a job ends, its address gets a signed POST, as specified by Standard Webhooks
+//! (<https://www.standardwebhooks.com>).
+
+use std::error::Error;
+use std::time::Duration;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use futures_util::future::join_all;
+use hmac::{Hmac, Mac};
+use reqwest::redirect::Policy;
+use reqwest::{Client, StatusCode};
+use serde_json::{Value, json};
+
+use engine::job::{Timestamp, Webhook};
+use store::{Job, Notification, Store, StoreError};
+
+/// Time between two searches for unsent notifications.
+const TICK: Duration = Duration::from_secs(1);
+/// Time that a receiver has to answer.
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// Notifications that are sent at the same time.
+const BATCH: u32 = 16;
+/// Pauses after failed attempts. After the last one the notification is given up.
+const PAUSES: [Duration; 9] = [
+    Duration::from_secs(5),
+    Duration::from_secs(10),
+    Duration::from_secs(60),
+    Duration::from_secs(300),
+    Duration::from_secs(1800),
+    Duration::from_secs(2 * 3600),
+    Duration::from_secs(6 * 3600),
+    Duration::from_secs(12 * 3600),
+    Duration::from_secs(24 * 3600),
+];
+
+/// Sends notifications until it is dropped. `allowed` are the hosts that the administrator allows.
+pub async fn send(store: Store, allowed: Vec<String>) {
+    // A redirection could lead to a host that is not allowed.
+    let client = Client::builder().timeout(TIMEOUT).redirect(Policy::none()).build();
+    let client = match client {
+        Ok(client) => client,
+        Err(error) => {
+            tracing::error!(%error, "webhooks can't be notified");
+            return;
+        }
+    };
+    let mut tick = tokio::time::interval(TICK);
+    loop {
+        tick.tick().await;
+        let due = match store.due_notifications(BATCH).await {
+            Ok(due) => due,
+            Err(error) => {
+                tracing::error!(%error, "notifications can't be read");
+                continue;
+            }
+        };
+        let sent = due.iter().map(|notification| notify(&store, &client, &allowed, notification));
+        for error in join_all(sent).await.into_iter().filter_map(Result::err) {
+            tracing::error!(%error, "a notification can't be recorded");
+        }
+    }
+}
+
+/// Sends a notification, and records how this ended.
+async fn notify(
+    store: &Store,
+    client: &Client,
+    allowed: &[String],
+    &Notification { id, job, attempts }: &Notification,
+) -> Result<(), StoreError> {
+    let job = store.job_of_any_lab(job).await?;
+    let Some(webhook) = &job.spec.webhook else { return store.notified(id).await };
+    let secret = store.webhook_secret(&job.lab, false).await?;
+    let failure = match post(client, allowed, webhook, (id, &job, &secret)).await {
+        Ok(()) => {
+            tracing::info!(job = %job.id, host = %webhook.place(), "the webhook was notified");
+            return store.notified(id).await;
+        }
+        Err(failure) => failure,
+    };
+    let pause = PAUSES.get(attempts as usize).filter(|_| !failure.is_final);
+    let next_at = pause.map(|pause| Timestamp::now().after(*pause));
+    let (host, reason) = (webhook.place(), &failure.reason);
+    match next_at {
+        Some(next_at) => {
+            tracing::warn!(job = %job.id, host, reason, %next_at, "the webhook was not notified");
+        }
+        None => tracing::error!(job = %job.id, host, reason, "the notification was given up"),
+    }
+    store.not_notified(id, reason, next_at).await
+}
+
+/// Why a notification was not received.
+struct Failure {
+    reason: String,
+    /// True if a repetition would fail, too.
+    is_final: bool,
+}
+
+async fn post(
+    client: &Client,
+    allowed: &[String],
+    webhook: &Webhook,
+    (id, job, secret): (i64, &Job, &[u8]),
+) -> Result<(), Failure> {
+    if !webhook.is_allowed(allowed) {
+        let reason = format!("the administrator does not allow the host {}", webhook.place());
+        return Err(Failure { reason, is_final: true });
+    }
+    let body = message(job).to_string();
+    let id = format!("{}.{id}", job.id);
+    let seconds = Timestamp::now().0 / 1000;
+    let answer = client
+        .post(webhook.as_str())
+        .header("content-type", "application/json")
+        .header("user-agent", concat!("sci-recon/", env!("CARGO_PKG_VERSION")))
+        .header("webhook-id", &id)
+        .header("webhook-timestamp", seconds)
+        .header("webhook-signature", format!("v1,{}", signature(secret, &id, seconds, &body)))
+        .body(body)
+        .send()
+        .await;
+    match answer.map(|answer| answer.status()) {
+        Ok(status) if status.is_success() => Ok(()),
+        Ok(status) => {
+            let reason = format!("the receiver answered {status}");
+            Err(Failure { reason, is_final: status == StatusCode::GONE })
+        }
+        Err(error) => {
+            // The address may contain a secret of the receiver.
+            let error = error.without_url();
+            let cause = std::iter::successors(error.source(), |cause| (*cause).source()).last();
+            let reason = cause.map_or(error.to_string(), |cause| format!("{error}: {cause}"));
+            Err(Failure { reason, is_final: false })
+        }
+    }
+}
+
+/// The body of a notification.
+fn message(job: &Job) -> Value {
+    json!({
+        "type": "job.ended",
+        "timestamp": job.finished_at,
+        "data": {
+            "id": job.id,
+            "href": format!("/v1/jobs/{}", job.id),
+            "lab": job.lab,
+            "label": job.spec.label,
+            "state": job.state,
+            "error": job.error,
+            "warnings": job.spec.warnings,
+            "assessment": job.assessment,
+        },
+    })
+}
+
+/// The HMAC-SHA256 of identifier, time and body, in base64.
+fn signature(secret: &[u8], id: &str, seconds: i64, body: &str) -> String {
+    // The HMAC accepts keys of any length.
+    let Ok(mut hmac) = Hmac::<sha2::Sha256>::new_from_slice(secret) else { return String::new() };
+    hmac.update(format!("{id}.{seconds}.{body}").as_bytes());
+    STANDARD.encode(hmac.finalize().into_bytes())
+}
+
+/// A secret as receivers configure it.
+#[must_use]
+pub fn secret_text(secret: &[u8]) -> String {
+    format!("whsec_{}", STANDARD.encode(secret))
+}
+
+#[cfg(test)]
+mod tests {
+    use base64::Engine;
+    use base64::engine::general_purpose::STANDARD;
+
+    use super::signature;
+
+    /// The example of the specification of Standard Webhooks.
+    #[test]
+    fn signatures_follow_the_specification() {
+        let secret = STANDARD.decode("MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw").unwrap();
+        let body = r#"{"test": 2432232314}"#;
+        let signed = signature(&secret, "msg_p5jXN8AQM9LWM0D4loKWxJek", 1_614_265_330, body);
+        assert_eq!(signed, "g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE=");
+    }
+}

@@ -1,0 +1,110 @@
+//! Registration of masks that have moved since their calibration.
+
+use serde_json::{Value, json};
+
+use crate::app::{TestApp, id};
+use crate::pipeline::{psnr, values};
+use crate::samples::{Scene, npy};
+
+const SCENE: Scene = Scene { frames: 4, height: 104, width: 112, snapshots: 1 };
+
+/// A mask's pixel as the area of a pattern that has moved down and to the right by quarters of a pixel.
+fn mask(frame: usize, row: usize, column: usize, quarters: [usize; 2]) -> f32 {
+    let cells = (0..16).map(|cell| {
+        let (row, column) = (4 * row + 32 + cell / 4, 4 * column + 32 + cell % 4);
+        SCENE.mask(frame, (row - quarters[0]) / 4, (column - quarters[1]) / 4)
+    });
+    cells.sum::<f32>() / 16.0
+}
+
+/// The calibrated masks [B,H,W].
+fn masks() -> Vec<u8> {
+    let Scene { frames, height, width, .. } = SCENE;
+    let places =
+        (0..frames * height * width).map(|at| (at / width / height, at / width, at % width));
+    let values = places.map(|(k, line, column)| mask(k, line % height, column, [0, 0]));
+    npy(&[frames, height, width], values)
+}
+
+/// A snapshot [H,W] behind masks that have moved.
+fn snapshot(quarters: [usize; 2]) -> Vec<u8> {
+    let Scene { frames, height, width, .. } = SCENE;
+    let value = |at: usize| {
+        let (row, column) = (at / width, at % width);
+        (0..frames).map(|k| mask(k, row, column, quarters) * SCENE.pixel(0, k, row, column)).sum()
+    };
+    npy(&[height, width], (0..height * width).map(value))
+}
+
+/// Runs a job to its end, and returns it with its frames.
+async fn run(app: &TestApp, measurement: &str, registration: &Value) -> (Value, Vec<u8>) {
+    let body = json!({
+        "measurement": measurement,
+        "algorithm": "gap-tv",
+        "tile": {"size": 72, "overlap": 16},
+        "registration": registration,
+    });
+    let job = app.submit(&body).await;
+    let ended = app.ended(&job).await;
+    assert_eq!(ended["state"], "succeeded", "{ended:#}");
+    let frames = app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/npy")).await.expect(200);
+    (ended, frames.bytes)
+}
+
+fn has_moved_masks(job: &Value) -> bool {
+    job["warnings"].as_array().unwrap().iter().any(|finding| finding["code"] == "moved_masks")
+}
+
+#[tokio::test]
+async fn moved_masks_are_corrected_and_reported() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let calibration = id(&app.calibrate(masks()).await.expect(201));
+    let moved = id(&app.measure(&calibration, snapshot([6, 3])).await.expect(201));
+    let (off, uncorrected) = run(&app, &moved, &json!("off")).await;
+    assert!(off["registered"].is_null() && !has_moved_masks(&off), "{off:#}");
+    let (auto, corrected) = run(&app, &moved, &json!("auto")).await;
+    let registered = &auto["registered"];
+    assert!(registered["applied"] == true && has_moved_masks(&auto), "{auto:#}");
+    for (axis, expected) in [(0, 1.5), (1, 0.75)] {
+        let shift = registered["shift"][axis].as_f64().unwrap();
+        assert!((shift - expected).abs() < 0.1, "{registered:#}");
+    }
+    assert!(
+        registered["error_after"].as_f64().unwrap() < registered["error_before"].as_f64().unwrap()
+    );
+    // The check of the measurement sees the drift, but the corrected job is not doubted.
+    let seen = |job: &Value, list: &Value| {
+        assert!(list.is_array(), "{job:#}");
+        list.as_array().unwrap().iter().any(|finding| {
+            ["drifted_masks", "shifted_masks", "foreign_masks"]
+                .iter()
+                .any(|code| finding["code"] == *code)
+        })
+    };
+    assert!(seen(&off, &off["assessment"]["reasons"]), "{off:#}");
+    assert!(!seen(&auto, &auto["assessment"]["reasons"]), "{auto:#}");
+    assert!(seen(&off, &off["warnings"]) && !seen(&auto, &auto["warnings"]), "{auto:#}");
+    let (_, stated) = run(&app, &moved, &json!({"shift": [1.5, 0.75]})).await;
+    let quality = [&uncorrected, &corrected, &stated].map(|file| psnr(SCENE, 0, &values(file)));
+    assert!(quality[1] > quality[0] + 3.0 && quality[2] > quality[0] + 3.0, "{quality:?}");
+    let path = format!("/v1/jobs/{}/exports/manifest", auto["id"].as_str().unwrap());
+    let manifest = app.get(&path).await.expect(200).json();
+    assert_eq!(manifest["content"]["registration"], *registered);
+
+    let far =
+        json!({"measurement": moved, "algorithm": "gap-tv", "registration": {"shift": [9, 0]}});
+    let refused = app.post("/v1/jobs", &far).await;
+    refused.problem(422, "invalid_request");
+    assert_eq!(refused.json()["errors"][0]["pointer"], "/registration/shift");
+}
+
+#[tokio::test]
+async fn masks_that_fit_are_used_unchanged() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let calibration = id(&app.calibrate(masks()).await.expect(201));
+    let measurement = id(&app.measure(&calibration, snapshot([0, 0])).await.expect(201));
+    let (_, expected) = run(&app, &measurement, &json!("off")).await;
+    let (auto, frames) = run(&app, &measurement, &json!("auto")).await;
+    assert!(auto["registered"]["applied"] == false && !has_moved_masks(&auto), "{auto:#}");
+    assert!(frames == expected, "the frames differ");
+}
