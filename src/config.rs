@@ -11,8 +11,7 @@ use ipnet::IpNet;
 use strum::IntoStaticStr;
 
 #[cfg(feature = "nats")]
-use engine::job::Pool;
-use engine::job::WorkerId;
+use engine::job::{Pool, Webhook, WorkerId};
 use engine::pipeline::networks::{NetworkError, find_library};
 use reconstruction::priors::onnx::Device;
 use store::Claimant;
@@ -69,7 +68,8 @@ pub struct ServeArguments {
         long = "webhook-host",
         env = "SCI_RECON_WEBHOOK_HOSTS",
         value_name = "HOST",
-        value_delimiter = ','
+        value_delimiter = ',',
+        value_parser = Webhook::allowed_host
     )]
     pub webhook_hosts: Vec<String>,
 

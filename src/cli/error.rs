@@ -1,6 +1,7 @@
 //! Errors of commands, with their exit codes.
 
 use std::fmt::Display;
+use std::fs::File;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -57,6 +58,17 @@ impl CliError {
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
     }
+}
+
+/// Opens a file that the user names. Opening a pipe would wait for its writer.
+pub fn open_input(path: &Path) -> Result<File> {
+    let meta = path.metadata().map_err(|error| CliError::file("read", path, &error))?;
+    let fault = match meta.file_type() {
+        kind if kind.is_dir() => "is a folder; pack its pictures into a zip or tar archive",
+        kind if !kind.is_file() => "is not a regular file",
+        _ => return File::open(path).map_err(|error| CliError::file("read", path, &error)),
+    };
+    Err(CliError::Input(format!("{} {fault}", path.display())))
 }
 
 impl From<ReconError> for CliError {

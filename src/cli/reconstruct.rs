@@ -21,7 +21,7 @@ use super::model::{Model, cut};
 use super::output::print_line;
 use super::progress::SnapshotBar;
 use super::verdict;
-use crate::cli::error::Result;
+use crate::cli::error::{Result, open_input};
 use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
@@ -71,7 +71,7 @@ pub struct Arguments {
     /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
     #[arg(long, value_name = "FILE")]
     dark: Vec<PathBuf>,
-    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
+    /// Map of the sensor's bad pixels, of the size of the masks: pixels that are not 0 are bad.
     #[arg(long, value_name = "FILE")]
     bad_pixels: Option<PathBuf>,
     /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
@@ -152,8 +152,8 @@ pub struct Arguments {
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
     /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json. Several snapshots have a
-    /// subfolder each, snapshot_0000 and so on.
-    #[arg(long, value_name = "FOLDER")]
+    /// subfolder each, snapshot_0000 and so on. Without it, the result is only measured.
+    #[arg(long, value_name = "FOLDER", required_unless_present_any = ["truth", "scene", "json"])]
     out: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
@@ -338,7 +338,7 @@ impl<'a> Sources<'a> {
 }
 
 fn sha256(path: &Path) -> Result<Sha256> {
-    let hashed = File::open(path).and_then(|mut file| Sha256::of_reader(&mut file));
+    let hashed = Sha256::of_reader(&mut open_input(path)?);
     Ok(hashed.map_err(|error| CliError::file("read", path, &error))?.0)
 }
 

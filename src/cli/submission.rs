@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{ArgGroup, Args};
 use serde_json::{Map, Value, json};
 
 use super::CliError;
@@ -19,9 +19,10 @@ use formats::{Axes, Crop, Packing};
 
 /// Options of the calibration, the measurement and the job.
 #[derive(Debug, Args)]
+#[command(group = ArgGroup::new("camera").args(["masks", "calibration"]).required(true).multiple(true))]
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
-    #[arg(long, value_name = "ID", required_unless_present = "masks", help_heading = CALIBRATION)]
+    #[arg(long, value_name = "ID", help_heading = CALIBRATION)]
     calibration: Option<CalibrationId>,
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
@@ -56,7 +57,7 @@ pub(super) struct SubmissionArguments {
     mosaic: Option<Mosaic>,
     #[command(flatten, next_help_heading = CALIBRATION)]
     dispersion: DispersionArguments,
-    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
+    /// Map of the sensor's bad pixels, of the size of the masks: pixels that are not 0 are bad.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     bad_pixels: Option<PathBuf>,
     /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].

@@ -101,7 +101,9 @@ pub(super) fn refuse_bad<'a>(
     }
     let codes: Vec<&str> = codes.into_iter().collect();
     match codes.as_slice() {
-        [] if is_bad => Err(CliError::ErrorsFound("the verdict is bad".into())),
+        [] if is_bad => Err(CliError::ErrorsFound(
+            "the verdict is bad: the expected PSNR is too low; see docs/DATA.md, section Expected PSNR".into(),
+        )),
         [] => Ok(()),
         _ => {
             let text = format!("the checks found {}: results will be wrong", codes.join(", "));

@@ -274,10 +274,15 @@ impl From<StoreError> for ApiError {
             }
             StoreError::Damaged { .. } => Code::FileDamaged,
             StoreError::Interrupted | StoreError::Restless(_) => Code::Unavailable,
+            damage if damage.is_damage() => {
+                tracing::error!(%error, "the database is damaged");
+                let detail = "the database of the service is damaged: its administrator must restore a backup";
+                return Self::new(Code::Unavailable, detail);
+            }
             StoreError::DatabaseGone(_) => {
                 tracing::error!(%error, "a change is refused");
-                let detail = "the database of the service was removed or replaced, so nothing is changed: its \
-                              administrator must restore it";
+                let detail = "the database of the service was removed, replaced or truncated, so nothing is changed: \
+                              its administrator must restore it";
                 return Self::new(Code::Unavailable, detail);
             }
             busy if busy.is_busy() => {

@@ -251,12 +251,18 @@ pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Arra
 
 /// Opens a file, and determines its length and format. `name` is the array that an error mentions.
 pub(super) fn open(path: &Path, name: &str) -> Result<(File, u64, Format)> {
-    let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
-    let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
     let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };
+    // Opening a pipe would wait for its writer.
+    let metadata = path.metadata().map_err(FormatError::io("open the file"))?;
+    if metadata.is_dir() {
+        return Err(unknown(
+            "it is a folder; pack its pictures into a zip or tar archive".to_owned(),
+        ));
+    }
     if !metadata.is_file() {
         return Err(unknown("it is not a regular file".to_owned()));
     }
+    let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
     if metadata.len() == 0 {
         return Err(unknown("it is empty".to_owned()));
     }

@@ -258,7 +258,7 @@ impl FindingCode {
                 Warning,
                 Error,
                 "pixels are hot, dead, or marked as not measured",
-                "nothing, if there are few; name a map of the sensor's bad pixels as `bad_pixels` of the calibration",
+                "if there are few, do nothing; otherwise name a map of the sensor's bad pixels as `bad_pixels` of the calibration",
             ),
             Self::BinaryMeasurement => (
                 &[Measurement],
@@ -292,14 +292,14 @@ impl FindingCode {
                 &[Measurement, Result],
                 Warning,
                 Warning,
-                "the brightness of the scene is implausible, for example below 0.12 or above 1.1 of the full scale in its brightest parts",
+                "the brightest parts of the scene are implausible, for example below 0.12 or above 1.1 of the full scale",
                 "state the `full_scale` of the measurement for its exposure and bit depth",
             ),
             Self::NoDark => (
                 &[Measurement],
                 Warning,
                 Error,
-                "the masks do not explain 3 % or more of the light, and no dark frames were named",
+                "3 % or more of the light is not explained by the masks, and no dark frames were named",
                 NAME_A_DARK,
             ),
             Self::WrongDark => (
@@ -375,7 +375,7 @@ impl FindingCode {
                 Error,
                 Error,
                 "the masks are inverted: open pixels are 0, closed ones 1",
-                "send 1 - C as the masks, and make the calibration again",
+                "create a new calibration with 1 - C as the masks",
             ),
             Self::FastMotion => (
                 &[Result],

@@ -114,6 +114,9 @@ impl Store {
         if serves && dir.is_full()? {
             dir.give_up_reserve()?;
         }
+        if !serves {
+            dir.check_files_of_server()?;
+        }
         identity::check(&dir, purpose, schema.newest()).await?;
         dir.fill()?;
         let copy = if serves { upgrade::save(&dir, schema.newest()).await? } else { None };
@@ -134,7 +137,8 @@ impl Store {
         let writer = SqlitePoolOptions::new()
             .max_connections(1)
             .idle_timeout(None)
-            .max_lifetime(None)
+            // SQLite opens a file read-only if it can't be written at this moment, and the connection stays so.
+            .max_lifetime(Duration::from_secs(60))
             // After some errors, such as a full disk, SQLite has rolled back already. sqlx then fails to roll back
             // again and takes the transaction for open.
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
@@ -154,6 +158,9 @@ impl Store {
             .connect_with(options.read_only(true))
             .await?;
         let files = database_file::DatabaseFiles::open(&dir.database())?;
+        if let Some(lock) = &server {
+            dir.record_files(lock, &files)?;
+        }
         let store = Self {
             dir,
             writer,
@@ -234,8 +241,12 @@ impl Store {
         self.damage.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Tries whether files can be made and written.
+    /// Tries whether the database can be changed, and files can be made and written.
     pub async fn try_disk(&self) -> Result<()> {
+        match self.try_change().await {
+            Err(error) if !error.is_busy() => return Err(error),
+            _ => {}
+        }
         let (store, byte) = (self.clone(), b"?");
         on_files(move || {
             let mut file = store.blob_writer()?;
@@ -245,6 +256,12 @@ impl Store {
             file.finish().map(|_| ())
         })
         .await
+    }
+
+    async fn try_change(&self) -> Result<()> {
+        let mut transaction = self.write().await?;
+        sql!("UPDATE folder SET generation = generation").execute(&mut *transaction).await?;
+        Ok(transaction.rollback().await?)
     }
 
     /// Errors: [`StoreError::DatabaseGone`] if the file of the database was removed or replaced since it was opened.

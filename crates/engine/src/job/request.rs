@@ -3,7 +3,8 @@
 use std::borrow::Cow;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::{Deserialize, Serialize};
+use serde::de::{DeserializeOwned, Error};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
@@ -125,7 +126,11 @@ pub struct JobRequest {
     pub tile: Option<TileSpec>,
     /// `auto` estimates and corrects a displacement of the masks since the calibration, `{"shift": [rows, columns]}`
     /// states it in pixels, and `off` uses the masks as they were calibrated; by default `auto`.
-    #[serde(default, skip_serializing_if = "RegistrationRequest::is_auto")]
+    #[serde(
+        default,
+        deserialize_with = "or_default",
+        skip_serializing_if = "RegistrationRequest::is_auto"
+    )]
     pub registration: RegistrationRequest,
     /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
@@ -363,6 +368,16 @@ impl JobSpec {
         let results = voxels * bytes + SNAPSHOT_BYTES;
         u64::from(self.snapshots.count) * results + self.snapshots_computed() * tiles * TILE_BYTES
     }
+}
+
+/// Reads a field whose null means the default. Another type is an error of this field: the JSON itself is sound.
+fn or_default<'de, T, D>(deserializer: D) -> Result<T, D::Error>
+where
+    T: Default + DeserializeOwned,
+    D: Deserializer<'de>,
+{
+    let value = Option::<serde_json::Value>::deserialize(deserializer)?;
+    value.map_or(Ok(T::default()), |value| serde_json::from_value(value).map_err(D::Error::custom))
 }
 
 #[cfg(test)]
