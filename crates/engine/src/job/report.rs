@@ -50,12 +50,10 @@ fn codes() -> Vec<&'static str> {
 }
 
 /// The grade of a calibration or a result.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, IntoStaticStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Serialize, Deserialize, IntoStaticStr, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
-#[derive(schemars::JsonSchema)]
 pub enum Grade {
     /// No findings.
     Good,

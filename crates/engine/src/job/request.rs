@@ -99,9 +99,8 @@ impl From<SnapshotSelection> for SelectionJson {
 }
 
 /// The body of `POST /v1/jobs`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct JobRequest {
     pub measurement: MeasurementId,
     /// If stated, it must be the calibration of the measurement. It is a check, not a choice.

@@ -22,9 +22,8 @@ const EXPOSURE_TOLERANCE: f64 = 1e-3;
 const MODEL_S: f64 = 1.0;
 
 /// The body of `POST /v1/calibrations`: masks, or the captures from which they are made.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 #[schemars(extend("anyOf" = [{ "required": ["masks"] }, { "required": ["captures"] }]))]
 pub struct CalibrationRequest {
     pub name: Option<Label>,
@@ -63,9 +62,8 @@ pub struct CalibrationRequest {
 }
 
 /// The body of `POST /v1/measurements`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct MeasurementRequest {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
@@ -106,9 +104,8 @@ pub struct MeasurementRequest {
 }
 
 /// The body of `POST /v1/models`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct ModelRequest {
     pub name: Option<Label>,
     pub calibration: CalibrationId,

@@ -106,9 +106,8 @@ impl FromStr for Label {
 }
 
 /// The SHA-256 hash of a file, which is also its address in the store.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, SerializeDisplay, DeserializeFromStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(SerializeDisplay, DeserializeFromStr)]
 pub struct Sha256([u8; 32]);
 
 impl Sha256 {
@@ -173,9 +172,8 @@ impl FromStr for Sha256 {
 }
 
 /// A time in milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text in UTC.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay, DeserializeFromStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(SerializeDisplay, DeserializeFromStr)]
 pub struct Timestamp(pub i64);
 
 impl JsonSchema for Timestamp {
