@@ -39,6 +39,7 @@ pub mod npy;
 pub mod planar;
 pub mod png;
 #[cfg(test)]
+#[path = "tests/support.rs"]
 mod test_support;
 mod tiff;
 pub mod validate;
