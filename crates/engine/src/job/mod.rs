@@ -29,7 +29,7 @@ pub use ids::{
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
-pub use pool::{InvalidPool, Pool};
+pub use pool::Pool;
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
 pub use registration::{Registered, RegistrationRequest};
