@@ -33,7 +33,7 @@ use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION}
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
-use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
+use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, TileRecord, changes};
 use engine::pipeline::registration;
 use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
@@ -617,7 +617,7 @@ impl Report {
         let SceneShape { height, width, .. } = recipe.shape.frame_shape(recipe.dispersion.as_ref());
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
-        let summary = Summary::of(&tiles);
+        let summary = TileRecord::summary(&tiles);
         let white_level = recipe.scale.white_level;
         let psnr_unit_db = quality.as_ref().map(|quality| quality.psnr);
         let quality = quality.map(|quality| quality.relative_to(white_level));

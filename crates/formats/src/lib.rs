@@ -39,6 +39,7 @@ pub mod npy;
 pub mod planar;
 pub mod png;
 #[cfg(test)]
+#[path = "tests/support.rs"]
 mod test_support;
 mod tiff;
 pub mod validate;
@@ -53,5 +54,5 @@ pub use natural::natural_key;
 pub use open::{Wanted, collect, open_array, open_stack, read_stack};
 pub use part::{Crop, Packing, Part};
 pub use samples::StackWriter;
-pub use stack::{FrameReader, FullScale, SampleType, StackInfo};
+pub use stack::{FrameReader, Frames, FullScale, SampleType, StackInfo};
 pub use window::WindowReader;

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 
+use super::limits::check;
 use super::member::{Member, MemberReader, quoted};
 use super::png::PngReader;
 use super::samples::read_error;
@@ -77,14 +78,7 @@ fn picture(
     (format, member): (Format, &Member),
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
-    if member.size > MAX_PICTURE_BYTES {
-        return Err(FormatError::OverLimit {
-            format,
-            what: "the length of a picture in bytes",
-            value: member.size,
-            limit: MAX_PICTURE_BYTES,
-        });
-    }
+    check(format, "the length of a picture in bytes", member.size, MAX_PICTURE_BYTES)?;
     let mut bytes = Vec::new();
     let read = MemberReader::new(Arc::clone(archive), member.clone()).read_to_end(&mut bytes);
     read.map_err(|error| in_member(&member.name)(read_error(format, error)))?;

@@ -30,6 +30,7 @@ pub mod priors;
 pub mod progress;
 pub mod projection;
 #[cfg(test)]
+#[path = "tests/reference.rs"]
 mod reference;
 pub mod registration;
 pub mod scale;

@@ -6,7 +6,7 @@ use std::time::Instant;
 use engine::job::{Algorithm, RunSpec, Sequence};
 use engine::pipeline::networks::{ModelRecord, NetworkSource};
 use engine::pipeline::quality::FrameQuality;
-use engine::pipeline::records::{PilotRecord, Summary, TileRecord};
+use engine::pipeline::records::{PilotRecord, TileRecord};
 use engine::pipeline::scale::white;
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::cpu_seconds;
@@ -221,7 +221,7 @@ impl Bench {
         let frame = |k| solved.frame(&input, k / frames, k % frames);
         let quality = Quality::of(&plan, frame, &measured.truth)?;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
-        let summary = Summary::of(&tiles);
+        let summary = TileRecord::summary(&tiles);
         let joints = solved.pilot.map(|pilot| pilot.joints).unwrap_or_default();
         Ok(Row {
             key,

@@ -1,8 +1,5 @@
 //! Job requests as users write them, and job specifications after all checks.
 
-use std::borrow::Cow;
-
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::{DeserializeOwned, Error};
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -12,7 +9,7 @@ use super::model::{JobModel, ModelChoice};
 use super::registration::{Registered, RegistrationRequest};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
-use super::text::{InvalidField, Label};
+use super::text::{InvalidField, Label, text_schema};
 use super::webhook::Webhook;
 use super::{Dispersion, Sha256};
 use reconstruction::ReconError;
@@ -45,26 +42,18 @@ pub enum SnapshotSelection {
     Range(u32, u32),
 }
 
-impl JsonSchema for SnapshotSelection {
-    fn schema_name() -> Cow<'static, str> {
-        "Selection".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        let index = json_schema!({
-            "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX,
-        });
-        json_schema!({
-            "description": "All snapshots, one by its index from 0, or [first, last] with both ends included.",
-            "default": "all",
-            "anyOf": [
-                { "type": "string", "enum": ["all"] },
-                index,
-                { "type": "array", "minItems": 2, "maxItems": 2, "items": index },
-            ],
-        })
-    }
-}
+text_schema!(SnapshotSelection, "Selection", {
+    "description": "All snapshots, one by its index from 0, or [first, last] with both ends included.",
+    "default": "all",
+    "anyOf": [
+        { "type": "string", "enum": ["all"] },
+        { "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX },
+        {
+            "type": "array", "minItems": 2, "maxItems": 2,
+            "items": { "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX },
+        },
+    ],
+});
 
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
@@ -100,9 +89,8 @@ impl From<SnapshotSelection> for SelectionJson {
 }
 
 /// The body of `POST /v1/jobs`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct JobRequest {
     pub measurement: MeasurementId,
     /// If stated, it must be the calibration of the measurement. It is a check, not a choice.

@@ -1,14 +1,12 @@
 //! Addresses that are notified when a job ends.
 
-use std::borrow::Cow;
 use std::str::FromStr;
 
 use derive_more::Display;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 use url::Url;
 
-use super::text::InvalidText;
+use super::text::{InvalidText, text_schema};
 
 /// An address that is notified when a job ends: `https:` or `http:` with a host, without user name and password.
 #[derive(Debug, Clone, PartialEq, Eq, Display, SerializeDisplay, DeserializeFromStr)]
@@ -76,22 +74,14 @@ impl FromStr for Webhook {
     }
 }
 
-impl JsonSchema for Webhook {
-    fn schema_name() -> Cow<'static, str> {
-        "Webhook".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({
-            "type": "string",
-            "format": "uri",
-            "description": "Address that is notified when the job ends. The administrator allows its host.",
-            "maxLength": Self::MAX_CHARS,
-            "pattern": "^https?://",
-            "example": "https://lab.example/hooks/sci-recon",
-        })
-    }
-}
+text_schema!(Webhook, "Webhook", {
+    "type": "string",
+    "format": "uri",
+    "description": "Address that is notified when the job ends. The administrator allows its host.",
+    "maxLength": Self::MAX_CHARS,
+    "pattern": "^https?://",
+    "example": "https://lab.example/hooks/sci-recon",
+});
 
 #[cfg(test)]
 mod tests {

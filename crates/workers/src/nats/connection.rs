@@ -89,7 +89,7 @@ impl Credential {
             values.next().map(|value| value.trim().to_owned())
         };
         let pool = field("pool").map(|name| name.parse()).transpose();
-        let pool = pool.map_err(|error: engine::job::InvalidPool| wrong(error.to_string()))?;
+        let pool = pool.map_err(|error: engine::job::InvalidText| wrong(error.to_string()))?;
         let authority = text.find("-----BEGIN CERTIFICATE-----").and_then(|start| {
             let mark = "-----END CERTIFICATE-----\n";
             let end = text.rfind(mark)? + mark.len();
