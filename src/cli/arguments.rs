@@ -236,9 +236,7 @@ impl NetworkArguments {
     }
 
     /// The networks on the stated device.
-    ///
-    /// # Errors
-    /// The device can't run a network; the text has the remedy.
+    /// Errors: the device can't run a network; the text has the remedy.
     pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable counts as not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());

@@ -31,9 +31,7 @@ const MAX_NAME: usize = 255;
 
 impl Core {
     /// Subscribes to the messages of this kind from all pools.
-    ///
-    /// # Errors
-    /// If the message server denies the subscription.
+    /// Errors: the message server denies the subscription.
     pub async fn listen(&self, kind: &str) -> Result<Subscriber, ClusterError> {
         let subscribed = self.connection.client.subscribe(format!("sci.v1.{kind}.*")).await;
         subscribed.map_err(ClusterError::nats("listen to workers"))

@@ -52,9 +52,7 @@ impl Core {
     }
 
     /// Creates missing streams, and records the identity of the stream of tiles.
-    ///
-    /// # Errors
-    /// If the message server refuses, or has no quorum.
+    /// Errors: the message server refuses, or has no quorum.
     pub async fn find_streams(&self) -> Result<(), ClusterError> {
         let identity = self.connection.make_streams().await?;
         let before = std::mem::replace(&mut *lock(&self.stream), identity.clone());
