@@ -79,7 +79,7 @@ pub(super) struct Events {
     /// Number of the last change for which events were sent.
     last: Arc<AtomicI64>,
     store: Store,
-    places: Places,
+    places: Places<Lab>,
     waiters: Waiters,
     closing: CancellationToken,
 }
@@ -91,7 +91,7 @@ impl Events {
         let last = Arc::default();
         let watching = watch(store.clone(), sender.clone(), Arc::clone(&last));
         tokio::spawn(closing.clone().run_until_cancelled_owned(watching));
-        let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
+        let (places, waiters) = (Places::for_labs(LISTENERS), Waiters::default());
         Self { sender, last, store, places, waiters, closing }
     }
 
@@ -338,7 +338,7 @@ struct Listener {
     closing: CancellationToken,
     /// Events to send next.
     waiting: VecDeque<Event>,
-    _place: Place,
+    _place: Place<Lab>,
 }
 
 impl Listener {

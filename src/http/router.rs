@@ -19,9 +19,10 @@ use tower_http::trace::TraceLayer;
 
 use super::access::{self, Rule};
 use super::app::App;
-use super::client_places::{self, Places};
+use super::client_places;
 use super::listen::connection_limit;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
+use super::shares::Places;
 use super::{
     algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
     layers, me, measurements, models, pictures, problems, quality, reference, reports, results,
@@ -149,7 +150,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(layers::method_not_allowed)
         .layer(DefaultBodyLimit::max(JSON_BYTES))
         .layer(CatchPanicLayer::custom(layers::panicked))
-        .layer(from_fn_with_state(Places::new(connection_limit()), client_places::limit))
+        .layer(from_fn_with_state(Places::for_clients(connection_limit()), client_places::limit))
         .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::relative_references))
         .layer(ServiceBuilder::new().layer(sniffing).layer(referrer).layer(framing))
