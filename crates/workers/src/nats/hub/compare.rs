@@ -38,7 +38,7 @@ impl Core {
             Ok::<_, PipelineError>((first, result.worker(), difference))
         });
         let (first, second, difference) = compared.await??;
-        figures::replayed(1);
+        figures::count(figures::REPLAYED, 1);
         match difference {
             None => {
                 lock(&self.replays).judge(task, true);
@@ -49,7 +49,7 @@ impl Core {
                     %task, first = %first.worker(), %second, difference,
                     "two workers disagree on a tile: one of them computes wrong results"
                 );
-                figures::mismatched(1);
+                figures::count(figures::MISMATCHED, 1);
                 lock(&self.replays).judge(task, false);
                 Ok(Verdict::Differs(format!("worker {} disagrees: {difference}", first.worker())))
             }

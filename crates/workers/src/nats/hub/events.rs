@@ -166,7 +166,7 @@ impl Core {
             Ok(event) => event,
             Err(error) => {
                 tracing::error!(%error, %pool, "an event can't be read; it is dropped");
-                figures::refused(1);
+                figures::count(figures::REFUSED, 1);
                 return Ok(());
             }
         };
@@ -190,7 +190,7 @@ impl Core {
         let prefix = names::output(pool, task, attempt, worker);
         let Some(remote) = self.task_of(pool, &event).await? else {
             tracing::info!(%task, attempt, %worker, "a report is refused: the attempt is not the worker's");
-            figures::refused(1);
+            figures::count(figures::REFUSED, 1);
             self.connection.purge(names::OUTPUTS, format!("{prefix}.>")).await?;
             return Ok(());
         };
@@ -205,7 +205,7 @@ impl Core {
                         let last = RemoteBeat { task, attempt, worker, pool, progress, history };
                         self.store.remote_beats(&[last], &[]).await?;
                         match self.store.complete(&lease, *completion).await? {
-                            Heartbeat::Lost => figures::refused(1),
+                            Heartbeat::Lost => figures::count(figures::REFUSED, 1),
                             _ => tracing::info!(%task, attempt, %worker, "a tile is done"),
                         }
                     }
@@ -214,13 +214,13 @@ impl Core {
                     }
                     Accepted::Refused(reason) => {
                         tracing::error!(%task, attempt, %worker, reason, "a worker's result is rejected");
-                        figures::rejected(1);
+                        figures::count(figures::REJECTED, 1);
                         let reason = format!("the result of worker {worker} is rejected: {reason}");
                         self.store.fail(&lease, &reason, true).await?;
                     }
                     Accepted::Lost(error) => {
                         tracing::warn!(%error, %task, attempt, %worker, "a tile's frames are lost");
-                        figures::repaired(1);
+                        figures::count(figures::REPAIRED, 1);
                         self.store.remote_lost(&remote, "its frames were lost in transit").await?;
                     }
                 }

@@ -193,7 +193,7 @@ impl Core {
         Ok(match self.store.remote_begin(task, (attempt, seq), delivery, worker).await? {
             Begun::Go(attempt, redelivered) => {
                 lock(&self.presence).begin(worker, task.0);
-                figures::redelivered(u64::from(redelivered));
+                figures::count(figures::REDELIVERED, u64::from(redelivered));
                 BeginAnswer::Go(attempt)
             }
             Begun::Over => BeginAnswer::Over,

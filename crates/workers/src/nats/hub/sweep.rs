@@ -226,7 +226,7 @@ impl Core {
     async fn repair(&self, remote: &RemoteTask, reason: &str) -> Result<(), StoreError> {
         if self.store.remote_task(remote.task).await?.as_ref() == Some(remote) {
             tracing::warn!(task = %remote.task, reason, "a tile is handed out again");
-            figures::repaired(1);
+            figures::count(figures::REPAIRED, 1);
             self.store.remote_lost(remote, reason).await?;
             self.more.notify_one();
         }
