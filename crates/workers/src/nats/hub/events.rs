@@ -18,7 +18,7 @@ use tokio::task::JoinHandle;
 
 use super::accept::{Accepted, Report};
 use super::core::{Core, lock};
-use super::error::EventError;
+use super::error::HubError;
 use super::figures;
 use crate::nats::blobs::BlobError;
 use crate::nats::connection::ClusterError;
@@ -161,7 +161,7 @@ impl Core {
         pool: &Pool,
         message: &Message,
         event: Result<Event, serde_json::Error>,
-    ) -> Result<(), EventError> {
+    ) -> Result<(), HubError> {
         let event = match event {
             Ok(event) => event,
             Err(error) => {
@@ -185,7 +185,7 @@ impl Core {
         }
     }
 
-    async fn handle(&self, pool: &Pool, event: Event) -> Result<(), EventError> {
+    async fn handle(&self, pool: &Pool, event: Event) -> Result<(), HubError> {
         let Event { task, attempt, worker, .. } = event;
         let prefix = names::output(pool, task, attempt, worker);
         let Some(remote) = self.task_of(pool, &event).await? else {
@@ -243,7 +243,7 @@ impl Core {
 
     /// Finds the tile of an event. Returns `None` if the worker does not own the attempt. If the worker began while the
     /// server was down, its begin is recorded now.
-    async fn task_of(&self, pool: &Pool, event: &Event) -> Result<Option<RemoteTask>, EventError> {
+    async fn task_of(&self, pool: &Pool, event: &Event) -> Result<Option<RemoteTask>, HubError> {
         let &Event { task, attempt, worker, seq, delivery, .. } = event;
         let remote = self.store.remote_task(task).await?;
         let Some(remote) = remote.filter(|remote| remote.pool == pool.as_str()) else {
@@ -264,7 +264,7 @@ impl Core {
         &self,
         prefix: &str,
         frames: Input,
-    ) -> Result<Result<StagedBlob, BlobError>, EventError> {
+    ) -> Result<Result<StagedBlob, BlobError>, HubError> {
         let store = self.store.clone();
         let mut writer = tokio::task::spawn_blocking(move || store.blob_writer()).await??;
         let (mut next, mut attempts) = (0, 0);
@@ -281,7 +281,7 @@ impl Core {
                         writer = written.await??;
                         next += 1;
                     }
-                    Some(Err(BlobError::Failed(reason))) => return Err(EventError::Fetch(reason)),
+                    Some(Err(BlobError::Failed(reason))) => return Err(HubError::Fetch(reason)),
                     Some(Err(BlobError::Missing)) => break true,
                     Some(Err(BlobError::Damaged)) => return Ok(Err(BlobError::Damaged)),
                     None => break false,

@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 
 use super::accept::is_possible;
 use super::core::{Core, lock};
-use super::error::EventError;
+use super::error::HubError;
 use super::figures;
 use super::presence::MAX_WORKERS;
 use crate::nats::connection::ClusterError;
@@ -184,7 +184,7 @@ impl Core {
     }
 
     /// Grants a worker an attempt, if no other worker owns the tile.
-    pub async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, EventError> {
+    pub async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, HubError> {
         let Begin { task, attempt, seq, delivery, worker } = begin;
         if self.leaves_to_another(pool, task, worker).await? {
             return Ok(BeginAnswer::Another);
