@@ -20,9 +20,9 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::{
-    Checked, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob,
-    NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError, Work,
-    WorkerEnd, WorkerPlace, WorkerTakes,
+    Checked, Claimant, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration,
+    NewJob, NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError,
+    Work, WorkerEnd, WorkerPlace,
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
@@ -86,7 +86,7 @@ impl Lab {
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();
-        store.worker_started(worker, 1, &WorkerPlace::default(), WorkerTakes::All).await.unwrap();
+        store.worker_started(worker, 1, &WorkerPlace::default(), Claimant::Local).await.unwrap();
         let asked = Submission::Calibration(asked);
         let passed = Checked::Masks(facts, upload(b"prepared masks"));
         let calibration = make(&store, worker, asked, passed).await;

@@ -16,7 +16,7 @@ use crate::tables::jobs;
 use crate::tables::measurements::Measurement;
 use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
-use crate::tables::workers::{self, WorkerTakes};
+use crate::tables::workers::{self, Claimant};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, MovieFormat, Sha256,
     Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
@@ -102,21 +102,6 @@ pub struct MovieWork {
     pub arrays: Vec<(PathBuf, Sha256)>,
 }
 
-/// The claimant of a task, which decides what it may have.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Claimant<'a> {
-    /// A worker of this machine that does all there is.
-    Local,
-    /// One that leaves the tiles to other machines.
-    WithoutTiles,
-    /// One that takes short tasks alone, so that they wait for no tile. It begins no job: a job would be shown as
-    /// running though nobody computes it.
-    Light,
-    /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
-    /// run out.
-    Pool(&'a str),
-}
-
 /// The statement that looks for work: a task that is ready, or a lease that has expired. Parameters: now,
 /// [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
 macro_rules! look_text {
@@ -196,15 +181,6 @@ macro_rules! take_text {
 
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
-    /// The tasks that a worker with these rights takes.
-    pub fn takes(self) -> WorkerTakes {
-        match self {
-            Self::Local | Self::Pool(_) => WorkerTakes::All,
-            Self::WithoutTiles => WorkerTakes::WithoutTiles,
-            Self::Light => WorkerTakes::ShortTasks,
-        }
-    }
-
     fn look(self) -> &'static str {
         match self {
             Self::Local => look_text!("", "tasks_ready"),

@@ -38,4 +38,4 @@ pub use tasks::{
     TileState,
 };
 pub use tokens::Token;
-pub use workers::{WorkerPlace, WorkerRow, WorkerTakes, WorkerTask};
+pub use workers::{Claimant, WorkerPlace, WorkerRow, WorkerTask};

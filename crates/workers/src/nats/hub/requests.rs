@@ -20,7 +20,7 @@ use crate::nats::names;
 use engine::job::Pool;
 use engine::pipeline::progress::is_history;
 use reconstruction::schedule::MAX_ITERATIONS;
-use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace, WorkerTakes};
+use store::{Begun, Claimant, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
 
 /// Time between two transactions that record signs of life.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -171,7 +171,8 @@ impl Core {
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        let started = self.store.worker_started(worker, pid, &location, WorkerTakes::All);
+        let started =
+            self.store.worker_started(worker, pid, &location, Claimant::Pool(pool.as_str()));
         if let Err(error) = started.await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
