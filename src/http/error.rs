@@ -310,8 +310,8 @@ impl From<StoreError> for ApiError {
         }
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
-            StoreError::Unready { .. } => Code::CalibrationNotReady,
-            StoreError::Unchecked { .. } => Code::MeasurementNotReady,
+            StoreError::NotReady { what: "calibration", .. } => Code::CalibrationNotReady,
+            StoreError::NotReady { .. } => Code::MeasurementNotReady,
             StoreError::InUse { .. } | StoreError::FileInUse(_) => Code::InUse,
             StoreError::State(_) | StoreError::NotFinal(_) | StoreError::Ended(_) => {
                 Code::IllegalState
@@ -355,11 +355,7 @@ impl From<StoreError> for ApiError {
             return Self::new(code, error.to_string()).retry_after(seconds);
         }
         // A failed calibration or measurement never becomes ready.
-        let may_succeed_later = !matches!(
-            error,
-            StoreError::Unready { error: Some(_), .. }
-                | StoreError::Unchecked { error: Some(_), .. }
-        );
+        let may_succeed_later = !matches!(error, StoreError::NotReady { error: Some(_), .. });
         Self { may_succeed_later, ..Self::new(code, error.to_string()) }
     }
 }

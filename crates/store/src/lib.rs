@@ -68,8 +68,8 @@ pub use tables::{
     FIRST_RESERVE, FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter,
     LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel,
     NewPartial, Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations,
-    TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, WorkerPlace,
-    WorkerRow, WorkerTask, share_error,
+    Resource, TaskCounts, TaskRecord, TaskTotals, Thing, TileHistory, TileResult, TileState, Token,
+    WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

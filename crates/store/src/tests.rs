@@ -68,7 +68,6 @@ impl Lab {
         let (masks, _) = store.store_upload(&local, None, upload(b"masks")).await.unwrap();
         let (data, _) = store.store_upload(&local, None, upload(b"data")).await.unwrap();
         let facts = NewCalibration {
-            name: None,
             masks: masks.sha256,
             format: "npy".into(),
             sample: "float32".into(),
@@ -91,7 +90,6 @@ impl Lab {
         let passed = Checked::Masks(facts, upload(b"prepared masks"));
         let calibration = make(&store, worker, asked, passed).await;
         let facts = NewMeasurement {
-            name: None,
             calibration,
             data: data.sha256,
             format: "npy".into(),
