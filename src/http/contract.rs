@@ -46,6 +46,7 @@ mod tests {
     use super::super::error::Problem;
     use super::super::jobs::JobBody;
     use super::super::measurements::MeasurementBody;
+    use super::super::models::ModelBody;
     use super::super::page::PageBody;
     use super::super::pictures::SpreadBody;
     use super::super::router::routes;
@@ -58,7 +59,7 @@ mod tests {
     use engine::job::{
         CalibrationReport, CalibrationRequest, JobRequest, MeasurementRequest, ModelRequest,
     };
-    use store::{Blob, BlobRow, Model, TileHistory};
+    use store::{Blob, BlobRow, TileHistory};
 
     const PROSE: &str = include_str!("contract.yaml");
     const METHODS: [&str; 7] = ["get", "head", "post", "put", "patch", "delete", "options"];
@@ -277,7 +278,7 @@ mod tests {
         let mut schemas = schemas_of! {
             SchemaSettings::draft2020_12().for_serialize();
             me::MeBody, session::SessionBody, labs::ListBody, PageBody<BlobRow>, PageBody<tus::UploadBody>,
-            PageBody<CalibrationBody>, CalibrationReport, PageBody<MeasurementBody>, PageBody<Model>,
+            PageBody<CalibrationBody>, CalibrationReport, PageBody<MeasurementBody>, PageBody<ModelBody>,
             algorithms::ListBody, PageBody<JobBody>, jobs::EstimateBody, samples::SampleBody,
             exports::movie::ExportBody, PageBody<results::SnapshotBody>, quality::QualityBody, tiles::TilesBody,
             TileHistory, SpreadBody, events::Change, system::SystemBody, system::Readiness,

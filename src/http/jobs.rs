@@ -15,7 +15,6 @@ use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
-use super::problems;
 use super::truth;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
@@ -142,13 +141,14 @@ impl JobProblem {
             FailureCause::Crash => Code::WorkerCrashed,
             FailureCause::Loss => Code::WorkerLost,
         });
+        let (.., remedy) = code.row();
         Self {
             problem: ApiError::new(code, error).problem_of_job(),
             stage: task.as_ref().map(|task| task.kind.into_str()),
             snapshot: task.as_ref().and_then(|task| task.kind.snapshot()),
             tile: task.as_ref().and_then(|task| task.kind.tile()),
             attempts: task.map(|task| task.attempts),
-            remedy: problems::meaning(code),
+            remedy,
         }
     }
 }

@@ -66,16 +66,12 @@ pub enum StoreError {
     DatabaseGone(PathBuf),
     #[error("there is no {what} {id}")]
     NotFound { what: &'static str, id: String },
-    #[error("{}", unready(*.id, .error.as_deref()))]
-    Unready {
-        id: engine::job::CalibrationId,
-        /// Why there will be none; none while they are made.
-        error: Option<String>,
-    },
-    #[error("{}", unchecked(*.id, .error.as_deref()))]
-    Unchecked {
-        id: engine::job::MeasurementId,
-        /// Why it did not pass; none while the check goes on.
+    #[error("{what} {id} {}", not_ready(.error.as_deref()))]
+    NotReady {
+        /// A calibration or a measurement.
+        what: &'static str,
+        id: String,
+        /// Why it did not pass its check; none while it is checked or made.
         error: Option<String>,
     },
     #[error("the {what} is used by {users} {by}; delete those first")]
@@ -156,21 +152,10 @@ fn database_failure(error: &sqlx::Error) -> String {
     }
 }
 
-fn unready(id: engine::job::CalibrationId, error: Option<&str>) -> String {
+fn not_ready(error: Option<&str>) -> String {
     match error {
-        None => {
-            format!(
-                "the masks of calibration {id} are still being made or checked; ask again in a moment"
-            )
-        }
-        Some(error) => format!("calibration {id} has failed: {error}"),
-    }
-}
-
-fn unchecked(id: engine::job::MeasurementId, error: Option<&str>) -> String {
-    match error {
-        None => format!("measurement {id} is still being checked; ask again in a moment"),
-        Some(error) => format!("measurement {id} has not passed its check: {error}"),
+        None => "is still being made or checked; ask again in a moment".to_owned(),
+        Some(error) => format!("has failed: {error}"),
     }
 }
 

@@ -56,21 +56,20 @@ pub use integrity::Audit;
 pub use locked::LockedFile;
 use migrations::Schema;
 pub use queue::{
-    Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, Claimant, ClaimedTask, Completion,
-    Estimate, Heartbeat, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
-    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
-    WorkerEnd,
+    Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, ClaimedTask, Completion, Estimate,
+    Heartbeat, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, MessagePlace,
+    Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work, WorkerEnd,
 };
 pub use rows::{Expired, Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Asked, Blob, BlobRow, Calibration, Change, Changes, Delivery, Entitlement, FIRST_RESERVE,
-    FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures,
-    LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel, NewPartial,
-    Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations, TaskCounts,
-    TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, WorkerPlace, WorkerRow,
-    WorkerTakes, WorkerTask, share_error,
+    Asked, Blob, BlobRow, Calibration, Change, Changes, Claimant, Delivery, Entitlement,
+    FIRST_RESERVE, FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter,
+    LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel,
+    NewPartial, Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations,
+    Resource, TaskCounts, TaskRecord, TaskTotals, Thing, TileHistory, TileResult, TileState, Token,
+    WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

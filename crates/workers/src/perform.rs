@@ -169,8 +169,6 @@ fn calibration(
 fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
     let report = &calibrated.report.report;
     NewCalibration {
-        // The store takes the name and the mosaic from the request.
-        name: None,
         masks,
         format: "captures".into(),
         sample: calibrated.sample.to_string(),
@@ -182,6 +180,7 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
         mask_mean: report.masks.mean,
         dead_pixels: report.masks.dead_pixels,
         clipped_negatives: calibrated.clipped_negatives,
+        // The store takes it from the request.
         mosaic: None,
         reading: None,
         dispersion: None,
