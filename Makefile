@@ -20,9 +20,9 @@ test: runtime judges $(TRAINING)/.stamp ## run all tests
 		SCI_RECON_TRAINING=$(abspath $(TRAINING))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
-deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them
+deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them, and use the service behind nginx and Caddy
 	$(CARGO) build --quiet
-	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
+	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon $(VENV)/uploads
 
 client-check: wheel ## check types, style and wheel of the Python client
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
