@@ -136,6 +136,7 @@ mod tests {
             .into_iter()
             .map(|(status, answer)| (status.as_str().unwrap().to_owned(), response(answer)))
             .collect();
+        let is_picture = answers.get("200") == Some(&reference("responses", "Picture"));
         let mut may = |names: &[(&str, &str)]| {
             for (status, name) in names {
                 answers.entry((*status).to_owned()).or_insert_with(|| reference("responses", name));
@@ -145,6 +146,9 @@ mod tests {
         if guarded {
             may(&[("400", "BadRequest"), ("401", "Unauthorized"), ("403", "Forbidden")]);
             may(&[("404", "NotFound"), ("429", "RateLimited"), ("500", "Internal")]);
+        }
+        if is_picture {
+            may(&[("406", "NotAcceptable")]);
         }
         if matches!(rule, Rule::ByMethod | Rule::AcrossLabs) {
             add(&["Lab"]);

@@ -51,6 +51,7 @@ codes! {
     CalibrationNotReady: StatusCode::CONFLICT, "Calibration is not ready", true;
     MeasurementNotReady: StatusCode::CONFLICT, "Measurement is not ready", true;
     MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Method not allowed", false;
+    NotAcceptable: StatusCode::NOT_ACCEPTABLE, "No acceptable media type", false;
     UploadStalled: StatusCode::REQUEST_TIMEOUT, "Upload stalled", true;
     OffsetMismatch: StatusCode::CONFLICT, "Offset does not match the bytes received so far", false;
     TusVersion: StatusCode::PRECONDITION_FAILED, "Unsupported version of tus", false;

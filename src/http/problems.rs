@@ -85,6 +85,9 @@ pub(super) fn meaning(code: Code) -> &'static str {
             "The measurement is still being checked. Wait until its state is ready. A failed measurement \
              never becomes ready; its problem has the reason."
         }
+        Code::NotAcceptable => {
+            "The header Accept excludes all media types that this address has. The detail lists them."
+        }
         Code::MethodNotAllowed => "The header Allow lists the methods of this address.",
         Code::UploadStalled => {
             "The service received no data for too long. Send the file again, preferably as a resumable \
