@@ -20,9 +20,9 @@ test: runtime judges $(TRAINING)/.stamp ## run all tests
 		SCI_RECON_TRAINING=$(abspath $(TRAINING))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
-deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them
+deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them, and use the service behind nginx and Caddy
 	$(CARGO) build --quiet
-	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
+	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon $(VENV)/uploads
 
 client-check: wheel ## check types, style and wheel of the Python client
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
@@ -107,11 +107,13 @@ fuzz: ## fuzz every decoder for SECONDS seconds of CPU; needs cargo install carg
 SECONDS ?= 60
 
 SCHEMATHESIS := $(VENV)/schemathesis
-schemathesis: runtime $(SCHEMATHESIS)/.stamp ## fuzz the API against its contract, with and without a token
+# Largest number of examples per operation and run. 60 make over 7,000 requests in the first of three runs.
+EXAMPLES ?= 60
+schemathesis: runtime $(SCHEMATHESIS)/.stamp ## fuzz the API against its contract, with and without a token; EXAMPLES=60
 	$(CARGO) build --release
 	ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PYTHON) tests/judges/schemathesis_runs.py $(SCHEMATHESIS)/bin/schemathesis \
-		$${CARGO_TARGET_DIR:-target}/release/sci-recon
+		$${CARGO_TARGET_DIR:-target}/release/sci-recon $(EXAMPLES)
 $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	$(PYTHON) -m venv $(SCHEMATHESIS)
 	$(SCHEMATHESIS)/bin/python -m pip install --quiet --requirement $<

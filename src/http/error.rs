@@ -68,6 +68,8 @@ codes! {
          ready; its problem has the reason.";
     MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Method not allowed", false,
         "The header Allow lists the methods of this address.";
+    NotAcceptable: StatusCode::NOT_ACCEPTABLE, "No acceptable media type", false,
+        "The header Accept excludes all media types that this address has. The detail lists them.";
     UploadStalled: StatusCode::REQUEST_TIMEOUT, "Upload stalled", true,
         "The service received no data for too long. Send the file again, preferably as a resumable upload \
          (/v1/uploads).";
@@ -113,7 +115,7 @@ codes! {
     TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Too many files wait for a check", true,
         "Too many files of the lab wait for a check. Retry when some checks are finished.";
     RateLimited: StatusCode::TOO_MANY_REQUESTS, "Too many requests", true,
-        "The token has sent more requests than allowed in a minute. Continue after the seconds in Retry- After.";
+        "The token has sent more requests than allowed in a minute. Continue after the seconds in Retry-After.";
     QueueFull: StatusCode::TOO_MANY_REQUESTS, "Job queue is full", true,
         "Too many jobs are in the queue. Retry later, or cancel some jobs.";
     Internal: StatusCode::INTERNAL_SERVER_ERROR, "Internal error", true,

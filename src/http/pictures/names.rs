@@ -180,7 +180,7 @@ impl Named for OfBlob {
         app.store.upload(lab, sha256).await?;
         let path = intake::upload(app, sha256).await?;
         let (limits, file) = (app.limits, path.clone());
-        let read_info = move || formats::open_stack(&file, &limits).map(|reader| *reader.info());
+        let read_info = move || formats::open_shown(&file, &limits).map(|reader| *reader.info());
         let info = tokio::task::spawn_blocking(read_info).await;
         let info = info.map_err(|error| ApiError::internal(&error))??;
         if !(1..=info.frames).contains(&frame) {

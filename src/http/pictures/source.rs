@@ -323,7 +323,7 @@ pub(super) fn expected_error(
 }
 
 fn nth_frame(path: &Path, limits: &Limits, frame: usize) -> Result<Array2<f32>, FormatError> {
-    let mut reader = formats::open_stack(path, limits)?;
+    let mut reader = formats::open_shown(path, limits)?;
     let mut current = reader.next_frame()?;
     for _ in 1..frame {
         current = reader.next_frame()?;

@@ -3,15 +3,19 @@ use ndarray::Array3;
 use proptest::prelude::{any, proptest};
 
 use super::Parts;
+use crate::display::{Encoding, Picture};
 use crate::npz::tests::archive;
 use crate::test_support::{assert_names, file, ramp, read, read_as, refusal, sample, survive};
-use crate::{Axes, Channels, Format, Limits, SampleType, open_stack, png};
+use crate::{Axes, Channels, Format, Limits, SampleType, open_stack};
 
 /// The frames as 8-bit PNG pictures.
 fn pictures(stack: &Array3<f32>) -> Vec<Vec<u8>> {
     stack
         .outer_iter()
-        .map(|frame| png::encode_u8(frame, Channels::Grey, 0.0, 255.0).unwrap())
+        .map(|frame| {
+            let picture = Picture::new(frame, Channels::Grey, (0.0, 255.0)).unwrap();
+            picture.encode(Encoding::Png).unwrap()
+        })
         .collect()
 }
 
