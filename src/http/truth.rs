@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use super::app::App;
-use super::error::{ApiError, Code, Result};
+use super::error::{ApiError, Result};
 use super::intake;
-use engine::intake::{Opened, Source};
+use engine::intake::{IntakeError, Opened, Source};
 use engine::job::{Lab, SceneShape, Sha256};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, Limits};
@@ -19,18 +19,20 @@ pub(super) async fn check(app: &App, lab: &Lab, truth: Sha256, shape: SceneShape
     let upload = intake::upload(app, truth).await.map_err(|error| error.at("/truth"))?;
     let limits = app.limits;
     let opened =
-        intake::run(app, lab, move || open(&upload, (None, None), limits, shape).map(drop)).await;
+        intake::run(app, lab, move || Ok(drop(open(&upload, (None, None), limits, shape)?))).await;
     opened.map_err(|error| error.at("/truth"))
 }
 
 /// Opens true frames, of one snapshot or of all, and checks their number and size. The truth of a colour sensor may have
 /// colours, or one colour for each pixel, as the sensor records it.
+///
+/// Errors: those of the file; [`IntakeError::Size`] for other frames than those of the job.
 pub(super) fn open(
     path: &Path,
     (full_scale, axes): (Option<f32>, Option<Axes>),
     limits: Limits,
     shape: SceneShape,
-) -> Result<(Opened, Channels)> {
+) -> Result<(Opened, Channels), IntakeError> {
     let source = Source::upload(path, SceneArray::Truth, full_scale, limits);
     let colours = if shape.mosaic.is_some() { source.open_colours()? } else { None };
     let (truth, channels) = match colours {
@@ -51,5 +53,12 @@ pub(super) fn open(
          snapshot, or {all} for all",
         info.frames
     );
-    Err(ApiError::new(Code::SizeMismatch, detail))
+    Err(IntakeError::Size { place: String::new(), detail })
+}
+
+/// Number of true frames before those of a snapshot.
+pub(super) fn frames_before(truth: &Opened, snapshot: usize, shape: SceneShape) -> usize {
+    let SceneShape { frames, snapshots, .. } = shape;
+    let has_all = truth.info.frames == frames * snapshots as usize;
+    if has_all { snapshot * frames } else { 0 }
 }

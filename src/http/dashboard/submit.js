@@ -1,12 +1,13 @@
 // A new job in three steps: calibration, measurement, and reconstruction with an estimate of its cost.
 
 import { announce, calmly, facts, h, put, say } from "./dom.js";
-import { askAbout, askScale, dropZone, problem } from "./drop.js";
-import { bytes, duration, exact, figure } from "./format.js";
+import { answer, ask, askAbout, askScale } from "./questions.js";
+import { dropZone, problem } from "./drop.js";
+import { bytes, exact, figure, roughly } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings, grade } from "./report.js";
 import { create, isAborted, get, send } from "./api.js";
-import { given, numberField, partFields, textField } from "./fields.js";
+import { dispersionFields, given, numberField, partFields, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
 const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
@@ -23,7 +24,8 @@ export async function submit(root, [query], signal) {
   };
   const measurement = measurementStep(form, changed, signal);
   const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, query.get("calibration"), signal);
-  const element = h("form", { class: "steps" }, calibration, measurement.element, job.element, h("div", { class: "row" }, button), result);
+  form.vary = calibration.vary;
+  const element = h("form", { class: "steps" }, calibration.element, measurement.element, job.element, h("div", { class: "row" }, button), result);
   element.addEventListener("submit", async (event) => {
     event.preventDefault();
     button.disabled = true;
@@ -49,7 +51,8 @@ function choice(name, label, options, chosen, changed) {
   return h("fieldset", { class: "choice" }, h("legend", null, label), options.map(input));
 }
 
-const SENSORS = [["", "grey"], ...["rggb", "bggr", "grbg", "gbrg"].map((name) => [name, `in colour, ${name.toUpperCase()}`])];
+const SPECTRAL = "spectral";
+const SENSORS = [["", "grey"], ...["rggb", "bggr", "grbg", "gbrg"].map((name) => [name, `in colour, ${name.toUpperCase()}`]), [SPECTRAL, "behind a prism or grating (spectral)"]];
 
 function calibrationStep(form, known, wake, wanted, signal) {
   const verdict = h("div", { class: "verdict", "aria-live": "polite" });
@@ -59,21 +62,54 @@ function calibrationStep(form, known, wake, wanted, signal) {
   };
   const name = textField("calibration-name", "Name of the calibration", "bench 3, f/8");
   const sensor = h("select", { id: "mosaic" }, SENSORS.map(([value, text]) => h("option", { value }, text)));
-  const nameRow = h("div", { class: "fields" }, name.element, h("label", { for: "mosaic" }, "The sensor is", sensor));
-  const settings = () => given({ name: name.value(), mosaic: sensor.value || null });
-  const parts = { known: stored(known, wanted, use, signal), masks: masks(settings, sensor, use, verdict, signal), captures: captures(settings, use, verdict, signal) };
+  const sensorLabel = h("label", { for: "mosaic" }, "The sensor is", sensor);
+  const nameRow = h("div", { class: "fields" }, name.element, sensorLabel);
+  const isSpectral = () => sensor.value === SPECTRAL;
+  const settings = () => given({ name: name.value(), mosaic: isSpectral() ? null : sensor.value || null });
+  const made = masks(() => given({ ...settings(), dispersion: isSpectral() ? dispersion.value() : null }), use, verdict, signal);
+  const dispersion = dispersionFields(() => made.repeat());
+  // A change of the sensor repeats the request with the same file.
+  sensor.addEventListener("change", () => {
+    arrange();
+    made.repeat();
+  });
+  const parts = { known: stored(known, wanted, use, signal), masks: made, captures: captures(settings, use, verdict, signal) };
   const options = [known.length > 0 && ["known", "A stored calibration"], ["masks", "Masks"], ["captures", "Raw captures"]].filter(Boolean);
+  let kind = options[0][0];
+  const arrange = () => {
+    // Captures are of one mask per frame.
+    [...sensor.options].at(-1).disabled = kind === "captures";
+    if (kind === "captures" && isSpectral()) sensor.value = "";
+    dispersion.element.hidden = !isSpectral() || kind !== "masks";
+  };
   const show = (value) => {
+    kind = value;
     for (const [key, part] of Object.entries(parts)) part.element.hidden = key !== value;
     nameRow.hidden = value === "known";
+    arrange();
     put(verdict);
     use(null);
     parts[value].wake?.();
   };
-  const first = options[0][0];
-  const element = step(1, "Calibration", choice("calibration-kind", "What do you have?", options, first, show), nameRow, Object.values(parts).map((part) => part.element), verdict);
-  queueMicrotask(() => show(first));
-  return element;
+  const radios = choice("calibration-kind", "What do you have?", options, kind, show);
+  const element = step(1, "Calibration", radios, nameRow, dispersion.element, Object.values(parts).map((part) => part.element), verdict);
+  queueMicrotask(() => show(kind));
+  /** Makes another calibration from the masks of the present one, with another window or other masks of a spectral camera. */
+  const vary = ({ crop, mask }) => {
+    const item = form.calibration;
+    if (kind !== "masks") {
+      radios.querySelector("[value=masks]").checked = true;
+      show("masks");
+      name.input.value = item.name ?? "";
+      sensor.value = item.dispersion ? SPECTRAL : item.mosaic ?? "";
+      made.adopt(item);
+    }
+    if (item.dispersion) dispersion.set({ ...item.dispersion, ...given({ mask: mask ?? null }) });
+    if (crop) made.part.set(crop);
+    arrange();
+    made.repeat();
+  };
+  return { element, vary };
 }
 
 /** Stored calibrations, each with a mask, name and grade. */
@@ -85,8 +121,8 @@ function stored(known, wanted, use, signal) {
   return { element, wake };
 }
 
-function masks(settings, sensor, use, verdict, signal) {
-  // The file that was dropped last, with the full scale and axes stated for it.
+function masks(settings, use, verdict, signal) {
+  // The file that was dropped last, with the full scale, array and axes stated for it.
   let last = null;
   const repeat = () => last && make(...last).catch((error) => put(verdict, problem(error)));
   const part = partFields("masks-part", true, repeat);
@@ -100,15 +136,37 @@ function masks(settings, sensor, use, verdict, signal) {
       put(verdict, accepted(item, signal), h("details", null, h("summary", null, `Full scale of the masks: ${exact(item.full_scale)}`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
     } catch (error) {
-      const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));
-      if (!question) throw error;
-      put(verdict, problem(error), question);
+      if (isAborted(error)) throw error;
+      const again = (next) => make(sha256, next).catch((later) => put(verdict, problem(later)));
+      put(verdict, problem(error), askAbout(error, stated, again, { frames: () => askFrames(error, part, repeat) }));
     }
   };
-  // A change of the sensor repeats the request with the same file.
-  sensor.addEventListener("change", repeat);
-  const drop = dropZone("masks", "Calibration set", `one mask per frame: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
-  return { element: h("div", null, drop.element, part.element) };
+  const drop = dropZone("masks", "Calibration set", `one mask per frame, or the only mask of a spectral camera: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
+  /** Takes the file of a stored calibration, with its settings. */
+  const adopt = ({ masks: file, full_scale, axes, reading }) => {
+    const { crop, frames, packing } = reading ?? {};
+    const [first, last_] = frames ?? [null, null];
+    part.set({ ...(crop ?? { row: null, column: null, height: null, width: null }), first, last: last_ });
+    part.setPacking(packing);
+    last = [file, given({ full_scale, axes })];
+  };
+  return { element: h("div", null, drop.element, part.element), part, repeat, adopt };
+}
+
+/** Largest number of masks of a calibration. */
+const MAX_MASKS = 64;
+
+/** Offers a range of the masks in a file: one for a spectral camera, otherwise those of one exposure. */
+function askFrames(error, part, repeat) {
+  const one = error.message.includes("dispersion");
+  const count = Number(/has (\d+) masks/.exec(error.message)?.[1] ?? /has (\d+) frames/.exec(error.message)?.[1] ?? MAX_MASKS);
+  const number = (label, value) => h("input", { type: "number", min: 0, max: count - 1, value, "aria-label": label });
+  const [first, last] = [number("First mask", 0), number("Last mask", one ? 0 : Math.min(count, MAX_MASKS) - 1)];
+  const apply = () => {
+    part.set({ first: first.value, last: one ? first.value : last.value });
+    repeat();
+  };
+  return ask("Masks", one ? "Which mask of the file is it, counted from 0?" : "Which masks of the file belong to one exposure, counted from 0?", first, !one && ["to", last], answer(one ? "Use this mask" : "Use these masks", apply));
 }
 
 function captures(settings, use, verdict, signal) {
@@ -140,7 +198,7 @@ function accepted(item, signal) {
   return [
     h("p", null, "The calibration is accepted. ", grade(item.id, signal)),
     facts([
-      ["Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
+      [item.dispersion ? "Masks of bands" : "Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them`) : "none"],
@@ -157,6 +215,7 @@ function measurementStep(form, changed, signal) {
   const wait = h("p", { class: "muted" }, "Select or create the calibration first.");
   const name = textField("measurement-name", "Name of the measurement", "shot 12");
   const [fps, exposure] = [numberField("fps", "Snapshots per second"), numberField("exposure", "Exposure in s")];
+  const saturation = numberField("saturation", "Saturated from (stored number)", 1);
   const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
   const darks = [];
   const darkList = h("p", { class: "muted" });
@@ -167,7 +226,7 @@ function measurementStep(form, changed, signal) {
     forget.hidden = darks.length === 0;
     if (last) make(last, known).catch((error) => put(verdict, problem(error)));
   };
-  const part = partFields("data-part", false, () => last && make(last, known).catch((error) => put(verdict, problem(error))));
+  const part = partFields("data-part", false, () => last && make(last, known).catch((error) => put(verdict, problem(error))), [saturation]);
   // The file that was dropped last, the full scale and axes stated for it, and the number of the latest attempt.
   let [last, known, attempt] = [null, {}, 0];
   const make = async (sha256, stated = {}) => {
@@ -176,7 +235,7 @@ function measurementStep(form, changed, signal) {
     form.measurement = null;
     changed();
     put(verdict);
-    const body = { name: name.value(), ...part.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
+    const body = { name: name.value(), ...part.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), saturation: saturation.value(), sequence: sequence.value || null };
     const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
     [last, known] = [sha256, stated];
     try {
@@ -187,12 +246,12 @@ function measurementStep(form, changed, signal) {
       form.measurement = item;
     } catch (error) {
       if (mine !== attempt) return;
-      const question = askAbout(error, stated, again) ?? (error.code === "size_mismatch" && askWindow(form.calibration, part));
-      if (!question) {
-        last = null;
-        throw error;
-      }
-      put(verdict, problem(error), question);
+      if (isAborted(error)) throw error;
+      const repeat = () => again(known);
+      put(verdict, problem(error), askAbout(error, stated, again, {
+        crop: () => askWindow(error, form, part, repeat),
+        mask: () => askExtent(form),
+      }));
       return;
     }
     const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale((full_scale) => again({ ...stated, full_scale }));
@@ -200,7 +259,7 @@ function measurementStep(form, changed, signal) {
     changed();
   };
   // A change of these fields repeats the request with the same file.
-  for (const input of [fps.input, exposure.input, sequence]) {
+  for (const input of [fps.input, exposure.input, saturation.input, sequence]) {
     input.addEventListener("change", () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
@@ -223,11 +282,33 @@ function measurementStep(form, changed, signal) {
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
 }
 
-/** Offers a window of the snapshots with the size of the masks. */
-function askWindow({ height, width }, part) {
-  return h("div", { class: "askscale", role: "group", "aria-label": "Window" },
-    h("p", null, h("b", null, `Does the file hold a window of ${height} × ${width} pixels that the masks show?`), " Enter its first row and column below. Otherwise select the calibration of this camera setting above."),
-    h("div", { class: "row" }, h("button", { type: "button", class: "small", onclick: () => part.propose(height, width) }, `Use a window of ${height} × ${width}`)));
+/** Offers the window in the middle of the measurement, the masks or both that both can have in common. */
+function askWindow(error, { calibration, vary }, part, repeat) {
+  const sizes = /measurement is (\d+)x(\d+).* are (\d+)x(\d+)/.exec(error.message)?.slice(1).map(Number);
+  if (!sizes) return null;
+  const [data, masks] = [{ height: sizes[0], width: sizes[1] }, { height: sizes[2], width: sizes[3] }];
+  const [height, width] = ["height", "width"].map((side) => Math.min(data[side], masks[side]));
+  // A window of a mosaic begins with an even row and column.
+  const middle = (length, whole) => Math.floor((whole - length) / 2) & (calibration.mosaic ? ~1 : ~0);
+  const window = (whole, before) => (whole.height > height || whole.width > width) && { row: (before?.row ?? 0) + middle(height, whole.height), column: (before?.column ?? 0) + middle(width, whole.width), height, width };
+  const [ofData, ofMasks] = [window(data, part.value().crop), window(masks, calibration.reading?.crop)];
+  const of = [ofData && "the measurement", ofMasks && "the masks"].filter(Boolean).join(" and of ");
+  const apply = () => {
+    if (ofData) part.set(ofData);
+    if (ofMasks) vary({ crop: ofMasks });
+    else repeat();
+  };
+  return ask("Window", "Was only a part of the sensor recorded?",
+    answer(`Use the middle ${height} × ${width} of ${of}`, apply),
+    h("span", { class: "muted" }, "If it is not in the middle, correct its first row and column in the window of the file afterwards. Otherwise select the calibration of this camera setting above."));
+}
+
+/** Offers the other area of a spectral camera's mask. */
+function askExtent({ calibration, vary }) {
+  const { dispersion } = calibration;
+  if (!dispersion) return null;
+  const [mask, words] = dispersion.mask === "scene" ? ["measurement", "the measurement"] : ["scene", "the scene"];
+  return ask("Area of the mask", "Which area does the mask cover?", answer(`The mask covers ${words}`, () => vary({ mask })));
 }
 
 function fits(item) {
@@ -246,10 +327,11 @@ function fits(item) {
 function jobStep(algorithms, form, signal) {
   const select = h("select", { id: "algorithm" }, algorithms.map((item) => h("option", { value: item.name, selected: item.name === "pnp-tv-fastdvdnet" }, item.name)));
   const label = textField("label", "Name of the job", "drop of milk, first try");
-  const priority = numberField("priority", "Priority (−100 to 0; admins up to 100)", 1);
+  const registration = h("select", { id: "registration" }, [["", "corrected if it helps"], ["off", "not corrected"]].map(([value, text]) => h("option", { value }, text)));
+  const priority = numberField("priority", "Priority, −100 to 0", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
-  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth }) });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth, registration: registration.value || null }) });
   const ask = calmly(250, async () => {
     if (!form.measurement || signal.aborted) return;
     const asked = JSON.stringify(request());
@@ -276,8 +358,9 @@ function jobStep(algorithms, form, signal) {
     ask();
   } }, "Remove the true frames");
   select.addEventListener("change", renew);
+  registration.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan,
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, h("label", { for: "registration" }, "Masks that have moved are", registration), priority.element), plan,
     h("details", null, h("summary", null, "True frames"), truth.element, h("div", { class: "row" }, forget)), estimate);
   queueMicrotask(renew);
   return { element, renew, request };
@@ -285,10 +368,10 @@ function jobStep(algorithms, form, signal) {
 
 /** Estimated time, computation, memory and disk space of a job. */
 function costs(found) {
-  const when = found.eta_seconds === null ? "not before a worker is running" : `in up to about ${duration(found.eta_seconds)}`;
+  const when = found.eta_seconds === null ? "not before a worker is running" : `in up to about ${roughly(found.eta_seconds)}`;
   return facts([
     ["Done", `${when}${found.queue_position > 1 ? `, position ${found.queue_position} in the queue` : ""}`],
-    ["CPU time", `up to about ${duration(found.cpu_seconds)}, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
+    ["CPU time", `up to about ${roughly(found.cpu_seconds)}, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
     ["Memory", `at most ${bytes(found.worker_memory_bytes)}`],
     ["Disk", `at most ${bytes(found.disk_bytes)}`],
   ]);
