@@ -259,7 +259,7 @@ function verdict(cell, job, before) {
   const expected = () => {
     const [kind, word] = job.state === "succeeded" ? verdictOf(job) : ["", ""];
     const psnr = job.assessment?.psnr_db ?? null;
-    show(kind, word, psnr !== null && h("span", { title: `Expected PSNR ${expectedRange(job.assessment)}` }, `about ${aboutDecibels(psnr)}`));
+    show(kind, word, psnr === null ? job.assessment && !found && "no expected PSNR" : h("span", { title: `Expected PSNR ${expectedRange(job.assessment)}` }, `about ${aboutDecibels(psnr)}`));
   };
   const asked = (cell.dataset.truth = `${job.id} ${job.truth}`);
   if (job.state !== "succeeded" || !job.truth) {

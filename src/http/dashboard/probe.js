@@ -32,11 +32,11 @@ export class Probe {
       return { input, element: h("label", { for: id, class: "row muted" }, label, input) };
     };
     this.select = select;
-    this.fields = [field("curve-row", "Row", height), field("curve-column", "Column", width), field("curve-row-2", "to row", height), field("curve-column-2", "Column", width)];
+    this.fields = [field("curve-row", "Row", height), field("curve-column", "column", width), field("curve-row-2", "to row", height), field("curve-column-2", "column", width)];
     this.hint = h("p", { class: "muted" });
     this.result = h("div", { "aria-live": "polite" });
     this.element = h("details", { class: "probe" }, h("summary", null, spectral ? "Spectra and profiles" : "Curves and profiles"),
-      h("div", { class: "row" }, select, this.fields.map((one) => one.element)), this.hint, this.result);
+      h("div", { class: "row" }, select, [this.fields.slice(0, 2), this.fields.slice(2)].map((pair) => h("span", { class: "row" }, pair.map((one) => one.element)))), this.hint, this.result);
     this.element.addEventListener("toggle", () => this.redraw());
     pane.tool = this;
     pane.marks.push((context, target, scale) => this.mark(context, target, scale));

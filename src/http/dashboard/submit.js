@@ -1,7 +1,7 @@
 // A new job in three steps: calibration, measurement, and reconstruction with an estimate of its cost.
 
 import { announce, calmly, facts, h, put, say } from "./dom.js";
-import { answer, ask, askAbout, askScale } from "./questions.js";
+import { askAbout, askExtent, askFrames, askMove, askScale, askWindow } from "./questions.js";
 import { dropZone, problem } from "./drop.js";
 import { bytes, exact, figure, roughly } from "./format.js";
 import { Captures } from "./captures.js";
@@ -153,22 +153,6 @@ function masks(settings, use, verdict, signal) {
   return { element: h("div", null, drop.element, part.element), part, repeat, adopt };
 }
 
-/** Largest number of masks of a calibration. */
-const MAX_MASKS = 64;
-
-/** Offers a range of the masks in a file: one for a spectral camera, otherwise those of one exposure. */
-function askFrames(error, part, repeat) {
-  const one = error.message.includes("dispersion");
-  const count = Number(/has (\d+) masks/.exec(error.message)?.[1] ?? /has (\d+) frames/.exec(error.message)?.[1] ?? MAX_MASKS);
-  const number = (label, value) => h("input", { type: "number", min: 0, max: count - 1, value, "aria-label": label });
-  const [first, last] = [number("First mask", 0), number("Last mask", one ? 0 : Math.min(count, MAX_MASKS) - 1)];
-  const apply = () => {
-    part.set({ first: first.value, last: one ? first.value : last.value });
-    repeat();
-  };
-  return ask("Masks", one ? "Which mask of the file is it, counted from 0?" : "Which masks of the file belong to one exposure, counted from 0?", first, !one && ["to", last], answer(one ? "Use this mask" : "Use these masks", apply));
-}
-
 function captures(settings, use, verdict, signal) {
   const button = h("button", { type: "button", class: "primary", disabled: true }, "Compute the masks");
   const found = new Captures(signal, () => (button.disabled = found.missing() !== null));
@@ -255,7 +239,7 @@ function measurementStep(form, changed, signal) {
       return;
     }
     const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale((full_scale) => again({ ...stated, full_scale }));
-    put(verdict, fits(form.measurement), doubt);
+    put(verdict, fits(form.measurement), doubt, askMove(form, part, () => again(known)));
     changed();
   };
   // A change of these fields repeats the request with the same file.
@@ -280,35 +264,6 @@ function measurementStep(form, changed, signal) {
     changed();
   };
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
-}
-
-/** Offers the window in the middle of the measurement, the masks or both that both can have in common. */
-function askWindow(error, { calibration, vary }, part, repeat) {
-  const sizes = /measurement is (\d+)x(\d+).* are (\d+)x(\d+)/.exec(error.message)?.slice(1).map(Number);
-  if (!sizes) return null;
-  const [data, masks] = [{ height: sizes[0], width: sizes[1] }, { height: sizes[2], width: sizes[3] }];
-  const [height, width] = ["height", "width"].map((side) => Math.min(data[side], masks[side]));
-  // A window of a mosaic begins with an even row and column.
-  const middle = (length, whole) => Math.floor((whole - length) / 2) & (calibration.mosaic ? ~1 : ~0);
-  const window = (whole, before) => (whole.height > height || whole.width > width) && { row: (before?.row ?? 0) + middle(height, whole.height), column: (before?.column ?? 0) + middle(width, whole.width), height, width };
-  const [ofData, ofMasks] = [window(data, part.value().crop), window(masks, calibration.reading?.crop)];
-  const of = [ofData && "the measurement", ofMasks && "the masks"].filter(Boolean).join(" and of ");
-  const apply = () => {
-    if (ofData) part.set(ofData);
-    if (ofMasks) vary({ crop: ofMasks });
-    else repeat();
-  };
-  return ask("Window", "Was only a part of the sensor recorded?",
-    answer(`Use the middle ${height} × ${width} of ${of}`, apply),
-    h("span", { class: "muted" }, "If it is not in the middle, correct its first row and column in the window of the file afterwards. Otherwise select the calibration of this camera setting above."));
-}
-
-/** Offers the other area of a spectral camera's mask. */
-function askExtent({ calibration, vary }) {
-  const { dispersion } = calibration;
-  if (!dispersion) return null;
-  const [mask, words] = dispersion.mask === "scene" ? ["measurement", "the measurement"] : ["scene", "the scene"];
-  return ask("Area of the mask", "Which area does the mask cover?", answer(`The mask covers ${words}`, () => vary({ mask })));
 }
 
 function fits(item) {
