@@ -41,7 +41,7 @@ export function glance(item, signal) {
   return [
     ready ? h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
     h("span", { class: "about" }, h("b", null, nameOf(item)),
-      ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
+      ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}${item.dispersion ? ", spectral" : ""}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
       ready && grade(item.id, signal), h("time", { class: "muted", datetime: item.created_at, title: momentInFull(item.created_at) }, moment(item.created_at))),
   ];
 }

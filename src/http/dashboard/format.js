@@ -13,7 +13,7 @@ export function expectedRange(assessment) {
 
 /** An estimated duration without digits that are uncertain: 75 -> "2 min". */
 export function roughly(seconds) {
-  return duration(seconds > 60 ? 60 * Math.ceil(seconds / 60) : seconds);
+  return duration(seconds > 60 ? 60 * Math.ceil(seconds / 60) : Math.max(1, seconds));
 }
 
 /** 75 -> "1 min 15 s". */

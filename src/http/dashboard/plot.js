@@ -3,7 +3,7 @@
 import { figure } from "./format.js";
 import { h, s } from "./dom.js";
 
-const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [170, 46, 8, 8, 34];
+const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [170, 46, 14, 8, 34];
 
 /** Round numbers between two values, at most `most`. */
 function ticks(from, to, most) {

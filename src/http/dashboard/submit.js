@@ -252,7 +252,7 @@ function measurementStep(form, changed, signal) {
   }, true);
   const inside = h("div", { hidden: true },
     h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Sequence of snapshots", sequence)),
-    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))), part.element);
+    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row below" }, darkList, forget))), part.element);
   const wake = () => {
     attempt += 1;
     inside.hidden = !form.calibration;
@@ -305,10 +305,12 @@ function jobStep(algorithms, form, signal) {
   };
   const truth = dropZone("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, async (blob) => {
     form.truth = blob.sha256;
+    forget.hidden = false;
     ask();
   });
-  const forget = h("button", { type: "button", class: "small", onclick: () => {
+  const forget = h("button", { type: "button", class: "small below", hidden: true, onclick: () => {
     form.truth = null;
+    forget.hidden = true;
     truth.clear();
     ask();
   } }, "Remove the true frames");
@@ -316,7 +318,7 @@ function jobStep(algorithms, form, signal) {
   registration.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
   const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, h("label", { for: "registration" }, "Masks that have moved are", registration), priority.element), plan,
-    h("details", null, h("summary", null, "True frames"), truth.element, h("div", { class: "row" }, forget)), estimate);
+    h("details", null, h("summary", null, "True frames"), truth.element, forget), estimate);
   queueMicrotask(renew);
   return { element, renew, request };
 }

@@ -50,9 +50,7 @@ export class Viewer {
     this.meaning = h("p", { class: "muted meaning", "aria-live": "polite" });
     this.choice.addEventListener("change", () => {
       this.rightContrast.touched = false;
-      const still = STILL.includes(this.mode());
-      if (still) this.player.stop();
-      this.player.element.hidden = still;
+      if (STILL.includes(this.mode())) this.player.stop();
       this.offerRight();
     });
     this.slice = new Slice(this.view, frames, height, () => this.sliceBase(), () => this.frameWindow, signal);
@@ -235,10 +233,11 @@ export class Viewer {
       this.ready = false;
       this.right.show(null);
       this.right.setNote(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "The job ended before any frame was computed." : "No frames yet. A coarse preview comes first, then the frames tile by tile.");
-      this.rightContrast.element.hidden = true;
+      this.rightContrast.element.hidden = this.player.element.hidden = true;
       return;
     }
     this.ready = true;
+    this.player.element.hidden = STILL.includes(this.mode());
     this.rightContrast.element.hidden = false;
     this.right.setNote("");
     this.showRight();

@@ -625,7 +625,7 @@ mod tests {
             let truth = TrueFrame { identity: "t".into(), channels, values };
             let picture = assembled.deviation(1, truth);
             let deviation = picture.reduce(&picture.whole(0)).unwrap();
-            assert_eq!(deviation, Array2::zeros((16, 20 * channels.count())));
+            assert_eq!(deviation, Array2::<f32>::zeros((16, 20 * channels.count())));
         }
         let picture = assembled.frame(1);
         assert_eq!(picture.reduce(&picture.whole(0)).unwrap(), colours.slice(s![1, .., ..]));
