@@ -18,8 +18,10 @@ pub(super) async fn check(app: &App, lab: &Lab, truth: Sha256, shape: SceneShape
     found.map_err(|error| ApiError::reference("/truth", error))?;
     let upload = intake::upload(app, truth).await.map_err(|error| error.at("/truth"))?;
     let limits = app.limits;
-    let opened =
-        intake::run(app, lab, move || Ok(drop(open(&upload, (None, None), limits, shape)?))).await;
+    let opened = intake::run(app, lab, move || {
+        open(&upload, (None, None), limits, shape).map(drop).map_err(ApiError::from)
+    })
+    .await;
     opened.map_err(|error| error.at("/truth"))
 }
 
