@@ -12,6 +12,7 @@ use super::context::Wait;
 use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
+use super::quality::{KEPT_QUALITIES, Qualities};
 use super::rate::Rates;
 use super::rendering::Pictures;
 use super::revocation::Revocations;
@@ -55,6 +56,7 @@ pub struct Services {
     /// The rate at which each token begins sessions.
     pub(super) session_rates: Rates<TokenId>,
     pub(super) pictures: Pictures,
+    pub(super) qualities: Qualities,
     pub(super) machine: Machine,
 }
 
@@ -83,6 +85,7 @@ impl App {
             revocations: Revocations::start(store.clone()),
             session_rates: Rates::new(SESSIONS_PER_MINUTE),
             pictures: Pictures::new(),
+            qualities: Qualities::new(KEPT_QUALITIES),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),

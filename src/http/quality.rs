@@ -5,6 +5,7 @@ use std::path::Path;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use ndarray::Axis;
+use quick_cache::sync::Cache;
 use serde::{Deserialize, Serialize};
 
 use super::conditional;
@@ -13,11 +14,17 @@ use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
 use super::results::{result_file, white_level};
-use super::truth::{next_frame, open};
+use super::truth::{frames_before, next_frame, open};
 use engine::intake::Opened;
 use engine::job::{JobId, SceneShape, Sha256};
 use engine::pipeline::quality::{FrameQuality, Quality};
 use formats::{Axes, Channels, Limits, npy};
+
+/// Comparisons by frames, truth and its reading, because a list of jobs asks for the same ones again and again.
+pub(super) type Qualities = Cache<String, Quality>;
+
+/// Number of comparisons that are kept.
+pub(super) const KEPT_QUALITIES: usize = 1000;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -53,14 +60,18 @@ pub(super) async fn show(
     })?;
     app.store.upload(&access.lab, truth).await?;
     result_file(&app, &job, Some(snapshot), "frames.npy").await?;
-    let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
-    let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
-    let (shape, limits) = (job.spec.frame_shape(), app.limits);
-    let frames = intake::run(&app, &access.lab, move || {
-        let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
-        compare((&path, channels), truth, snapshot as usize, shape)
-    });
-    let quality: Quality = frames.await?.into();
+    let (file, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
+    let measure = async {
+        let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
+        let (shape, limits) = (job.spec.frame_shape(), app.limits);
+        let frames = intake::run(&app, &access.lab, move || {
+            let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
+            compare((&path, channels), truth, snapshot as usize, shape)
+        });
+        Ok::<_, ApiError>(frames.await?.into())
+    };
+    let key = format!("{} {snapshot} {truth} {full_scale:?} {axes:?}", file.sha256);
+    let quality = app.qualities.get_or_insert_async(&key, measure).await?;
     let peak = white_level(&app, id).await?.unwrap_or(1.0);
     conditional::json(&QualityBody { truth, peak, quality: quality.relative_to(peak) }, &headers)
 }
@@ -73,9 +84,8 @@ fn compare(
     snapshot: usize,
     shape: SceneShape,
 ) -> Result<Vec<FrameQuality>> {
-    let SceneShape { frames, height, snapshots, mosaic, .. } = shape;
-    let has_all = truth.info.frames == frames * snapshots as usize;
-    let skipped = if has_all { snapshot * frames } else { 0 };
+    let SceneShape { frames, height, mosaic, .. } = shape;
+    let skipped = frames_before(&truth, snapshot, shape);
     for frame in 0..skipped {
         next_frame(&mut truth, frame)?;
     }

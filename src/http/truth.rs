@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
-use super::app::App;
-use super::error::{ApiError, Code, Result};
-use super::intake;
 use ndarray::Array2;
 
-use engine::intake::{Opened, Source};
+use super::app::App;
+use super::error::{ApiError, Result};
+use super::intake;
+use engine::intake::{IntakeError, Opened, Source};
 use engine::job::{Lab, SceneShape, Sha256};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, FormatError, Limits};
@@ -44,12 +44,14 @@ pub(super) fn next_frame(truth: &mut Opened, frame: usize) -> Result<Array2<f32>
 
 /// Opens true frames, of one snapshot or of all, and checks their number and size. The truth of a colour sensor may have
 /// colours, or one colour for each pixel, as the sensor records it.
+///
+/// Errors: those of the file; [`IntakeError::Size`] for other frames than those of the job.
 pub(super) fn open(
     path: &Path,
     (full_scale, axes): (Option<f32>, Option<Axes>),
     limits: Limits,
     shape: SceneShape,
-) -> Result<(Opened, Channels)> {
+) -> Result<(Opened, Channels), IntakeError> {
     let source = Source::upload(path, SceneArray::Truth, full_scale, limits);
     let colours = if shape.mosaic.is_some() { source.open_colours()? } else { None };
     let (truth, channels) = match colours {
@@ -70,5 +72,12 @@ pub(super) fn open(
          snapshot, or {all} for all",
         info.frames
     );
-    Err(ApiError::new(Code::SizeMismatch, detail))
+    Err(IntakeError::Size { place: String::new(), detail })
+}
+
+/// Number of true frames before those of a snapshot.
+pub(super) fn frames_before(truth: &Opened, snapshot: usize, shape: SceneShape) -> usize {
+    let SceneShape { frames, snapshots, .. } = shape;
+    let has_all = truth.info.frames == frames * snapshots as usize;
+    if has_all { snapshot * frames } else { 0 }
 }

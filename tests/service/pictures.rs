@@ -80,6 +80,24 @@ async fn images_show_the_frames_unchanged() {
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
     app.get(&format!("{pictures}/difference-2")).await.expect(200);
 
+    // The true error is the frame minus the true frame, of this snapshot or of all.
+    app.get(&format!("{pictures}/deviation-1")).await.problem(404, "not_found");
+    for first in [0, Scene::SMALL.frames] {
+        let shape = [first + Scene::SMALL.frames, height, width];
+        let true_value = |at: usize| if at < first * plane { 9.0 } else { (at % plane) as f32 };
+        let truth = npy(&shape, (0..shape[0] * plane).map(true_value));
+        let truth = json!({"truth": app.upload(truth).await});
+        let change = app.request(Method::PATCH, &format!("/v1/jobs/{job}")).json(&truth);
+        app.send(change).await.expect(200);
+        let error = app.get(&format!("{pictures}/deviation-2/values/0/0/0")).await.expect(200);
+        for (at, error) in error.bytes.chunks(4).enumerate() {
+            let error = f32::from_le_bytes(error.try_into().unwrap());
+            let expected = frames[plane + at] - at as f32;
+            assert!((error - expected).abs() < 1e-3, "{at}: {error} {expected}");
+        }
+    }
+    app.get(&format!("{pictures}/colours")).await.problem(404, "not_found");
+
     // Masks and measurement have images too.
     let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
     let masks = format!("/view/calibrations/{}/pictures", calibration.as_str().unwrap());
