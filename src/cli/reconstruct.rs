@@ -224,6 +224,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let cost = CostRecord {
         provider: uses_network.then(|| setup.network.provider().into()),
         onnxruntime: if records_version { Some(setup.network.version()?) } else { None },
+        gpu: setup.network.gpu_name(&setup.schedule),
         cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };

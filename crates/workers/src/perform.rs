@@ -291,6 +291,7 @@ fn tile(
             None => source.provider().into(),
         }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
+        gpu: source.gpu_name(&task.schedule),
         cpu_seconds: cpu_seconds() - before + process_seconds,
         peak_rss_bytes: peak_rss_bytes() + process_peak,
     };

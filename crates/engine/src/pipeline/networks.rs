@@ -16,6 +16,10 @@ use reconstruction::ReconError;
 use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
 use reconstruction::priors::onnx::{Device, EndToEndNetwork, Runtime};
 use reconstruction::priors::{Denoiser, Encoder, Network, Networks};
+#[cfg(feature = "gpu")]
+use reconstruction::{
+    gpu::adapter::Gpu, operator::SensingOperator, priors::registry::PriorSpec, solver::reconstruct,
+};
 
 /// A network embedded in the program as ONNX files, so that only libonnxruntime has to be installed.
 #[derive(Debug, Clone, Copy)]
@@ -186,12 +190,21 @@ pub struct NetworkSource {
     models: Option<PathBuf>,
     device: Device,
     version: Arc<OnceLock<String>>,
+    #[cfg(feature = "gpu")]
+    gpu: Arc<OnceLock<Result<Arc<Gpu>, ReconError>>>,
 }
 
 impl NetworkSource {
     /// A source that uses this libonnxruntime or, for `None`, the one that [`find_library`] finds.
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
-        Self { library, models: None, device, version: Arc::default() }
+        Self {
+            library,
+            models: None,
+            device,
+            version: Arc::default(),
+            #[cfg(feature = "gpu")]
+            gpu: Arc::default(),
+        }
     }
 
     /// Uses the networks in `folder`, which is organised like `models/`, instead of the embedded ones.
@@ -256,6 +269,46 @@ impl NetworkSource {
         })
     }
 
+    /// The GPU that runs stages of total variation, opened at the first call. `None` with `--device cpu` or `cuda:N`.
+    ///
+    /// # Errors
+    /// It can't be used.
+    #[cfg(feature = "gpu")]
+    pub fn gpu(&self) -> Result<Option<Arc<Gpu>>, ReconError> {
+        if self.device != Device::Gpu {
+            return Ok(None);
+        }
+        let opened = self.gpu.get_or_init(|| Gpu::open().map(Arc::new));
+        let opened = opened.as_ref().map_err(|error| ReconError::Runtime(error.to_string()))?;
+        Ok(Some(Arc::clone(opened)))
+    }
+
+    /// The GPU that runs the total variation of a schedule, for records. `None` if the CPU does.
+    #[cfg_attr(not(feature = "gpu"), expect(unused_variables, clippy::unused_self))]
+    pub fn gpu_name(&self, schedule: &Schedule) -> Option<String> {
+        #[cfg(feature = "gpu")]
+        if schedule.stages.iter().any(|stage| matches!(stage.prior, PriorSpec::Tv(_))) {
+            return Some(self.gpu().ok()??.name().to_owned());
+        }
+        None
+    }
+
+    /// Largest difference between the GPU and the CPU in a few iterations of total variation.
+    #[cfg(feature = "gpu")]
+    fn kernel_difference(&self) -> Result<f32, ReconError> {
+        let masks = Array3::from_shape_fn((3, 16, 16), |(k, i, j)| ((i * j + k) % 3) as f32 / 2.0);
+        let operator = SensingOperator::new(masks)?;
+        let ramp = Array3::from_shape_fn((3, 16, 16), |(k, i, j)| (k + i + j) as f32 / 32.0);
+        let y = operator.forward(ramp.view())?;
+        let schedule = Schedule::gap_tv3d().with_iterations(3);
+        let solve = |networks: &mut dyn Networks| {
+            let solved = reconstruct(&operator, y.view(), &schedule, networks, &mut ());
+            solved.map(|outcome| outcome.frames)
+        };
+        let on_gpu = solve(&mut WarmNetworks::new(self.clone()))?;
+        Ok(largest_difference(&on_gpu, &solve(&mut ())?))
+    }
+
     /// Largest difference between the device and the CPU in a pass of FFDNet over a small ramp.
     fn agreement(&self) -> Result<f32, String> {
         let text = |error: &dyn std::fmt::Display| error.to_string();
@@ -271,10 +324,9 @@ impl NetworkSource {
         };
         let on_device = pass(self.device).map_err(|error| text(&error))?;
         let on_cpu = pass(Device::Cpu).map_err(|error| text(&error))?;
-        let difference = on_device.iter().zip(&on_cpu).map(|(a, b)| (a - b).abs());
-        // `f32::max` would drop a NaN.
-        let largest =
-            difference.fold(0.0, |one: f32, other| if other <= one { one } else { other });
+        let largest = largest_difference(&on_device, &on_cpu);
+        #[cfg(feature = "gpu")]
+        let largest = largest + self.kernel_difference().map_err(|error| text(&error))?;
         if largest <= MAX_DIFFERENCE {
             return Ok(largest);
         }
@@ -403,6 +455,18 @@ impl Networks for WarmNetworks {
         };
         Ok(Some(self.encoder.insert(encoder)))
     }
+
+    #[cfg(feature = "gpu")]
+    fn gpu(&mut self) -> Result<Option<Arc<Gpu>>, ReconError> {
+        self.source.gpu()
+    }
+}
+
+/// Largest difference between two clips; NaN if any value is.
+fn largest_difference(one: &Array3<f32>, other: &Array3<f32>) -> f32 {
+    let differences = one.iter().zip(other).map(|(a, b)| (a - b).abs());
+    // `f32::max` would drop a NaN.
+    differences.fold(0.0, |one: f32, other| if other <= one { one } else { other })
 }
 
 fn existing(path: &Path) -> Option<PathBuf> {
