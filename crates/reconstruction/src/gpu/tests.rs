@@ -62,13 +62,13 @@ fn relative_difference(frames: &Array3<f32>, reference: &[f64]) -> f64 {
 #[test]
 fn iterations_are_those_of_the_equations() {
     let Some(gpu) = gpu() else { return };
-    let mut on = On(gpu);
-    for seed in 0..24 {
+    let (mut on, mut largest) = (On(gpu), 0.0f64);
+    for seed in 0..16 {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let method = ["gap", "admm"][seed as usize % 2];
         let mut problem = match seed {
-            0 | 1 => Problem::with_size((8, 64, 64), rng.clone(), method),
-            2 => Problem::with_size((3, 1, 1), rng.clone(), method),
+            0 => Problem::with_size((8, 64, 64), rng.clone(), method),
+            1 => Problem::with_size((3, 1, 1), rng.clone(), method),
             _ => Problem::random(seed, method),
         };
         let mut schedule = serde_json::to_value(&problem.schedule).unwrap();
@@ -88,20 +88,22 @@ fn iterations_are_those_of_the_equations() {
         for (place, frames) in [("GPU", problem.solve_with(&mut on)), ("CPU", problem.solve())] {
             let difference = relative_difference(&frames, &reference);
             assert!(difference < TOLERANCE, "{place} {seed}: {difference}, {:?}", problem.schedule);
+            largest = largest.max(difference);
         }
     }
+    eprintln!("largest difference from the reference, relative to the largest value: {largest:e}");
 }
 
 /// A moving grating behind random masks; some pixels are not measured.
 fn scene() -> (SensingOperator, Array3<f32>) {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
-    let masks = Array3::from_shape_simple_fn((8, 64, 64), || rng.random::<f32>().round());
+    let masks = Array3::from_shape_simple_fn((4, 40, 32), || rng.random::<f32>().round());
     let operator = SensingOperator::new(masks).unwrap();
-    let frames = Array3::from_shape_fn((8, 64, 64), |(k, i, j)| {
+    let frames = Array3::from_shape_fn((4, 40, 32), |(k, i, j)| {
         0.5 + 0.4 * ((i + 2 * j) as f32 / 5.0 + k as f32 / 2.0).sin()
     });
     let mut y = operator.forward(frames.view()).unwrap();
-    y.slice_mut(s![.., 20..23, 30..36]).fill(f32::NAN);
+    y.slice_mut(s![.., 20..23, 22..26]).fill(f32::NAN);
     (operator, y)
 }
 
@@ -126,14 +128,14 @@ fn solve(schedule: &Schedule, networks: &mut dyn Networks) -> Result<(Outcome, V
 fn a_reconstruction_stops_where_that_of_the_cpu_stops() {
     let Some(gpu) = gpu() else { return };
     let mut on = On(gpu);
-    for mut schedule in [Schedule::gap_tv(), Schedule::gap_tv3d(), Schedule::admm_tv()] {
-        schedule.stages[0].tolerance = 8e-3;
+    for mut schedule in [Schedule::gap_tv3d(), Schedule::admm_tv()] {
+        // Convergence at iteration 40, between two reads of the sums.
+        let (_, fixed) = solve(&schedule.clone().with_iterations(40), &mut ()).unwrap();
+        schedule.stages[0].tolerance = (fixed[38][1] * fixed[39][1]).sqrt();
         let (cpu, cpu_steps) = solve(&schedule, &mut ()).unwrap();
         let (one, steps) = solve(&schedule, &mut on).unwrap();
-        // After a few reads of the sums, and between two of them.
-        assert!(cpu.iterations > 40 && cpu.iterations % 32 > 0, "{}", cpu.iterations);
-        assert!(cpu.iterations < schedule.planned_iterations(), "it converges");
-        assert_eq!((one.iterations, steps.len()), (cpu.iterations, cpu_steps.len()));
+        assert_eq!((cpu.iterations, cpu_steps.len()), (40, 40));
+        assert_eq!((one.iterations, steps.len()), (40, 40));
         assert_eq!(one.stop_reason, cpu.stop_reason);
         for (step, expected) in steps.iter().flatten().zip(cpu_steps.iter().flatten()) {
             assert!((step / expected - 1.0).abs() < 1e-3, "{step}, not {expected}");
@@ -161,10 +163,10 @@ fn a_small_device_is_refused_in_words() {
     if gpu().is_none() {
         return;
     }
-    let small = |limits| Limits { max_storage_buffer_binding_size: 64 << 10, ..limits };
+    let small = |limits| Limits { max_storage_buffer_binding_size: 16 << 10, ..limits };
     let gpu = Arc::new(Gpu::open_with(small).unwrap());
     let error = solve(&Schedule::gap_tv(), &mut On(gpu)).unwrap_err().to_string();
-    assert!(error.contains("65536 bytes") && error.contains("smaller tiles"), "{error}");
+    assert!(error.contains("16384 bytes") && error.contains("smaller tiles"), "{error}");
     let too_much = |limits| Limits { max_storage_buffers_per_shader_stage: u32::MAX, ..limits };
     let error = Gpu::open_with(too_much).unwrap_err().to_string();
     assert!(error.contains("can't run"), "{error}");
