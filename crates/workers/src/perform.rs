@@ -288,7 +288,7 @@ fn tile(
     let cost = CostRecord {
         provider: uses_network.then(|| match task.model {
             Some(_) => model_provider.into(),
-            None => source.provider().into(),
+            None => source.provider(&task.schedule).into(),
         }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
         gpu: source.gpu_name(&task.schedule),

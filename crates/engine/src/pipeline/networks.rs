@@ -1,7 +1,6 @@
 //! Networks: the embedded ones, those of a folder, users' end-to-end networks, and the libonnxruntime that runs them.
 
 use std::borrow::Cow;
-use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -212,23 +211,24 @@ impl NetworkSource {
         Self { models: folder, ..self }
     }
 
-    /// The records of the networks that a schedule uses on this device.
+    /// The records of the networks that a schedule uses.
     pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;
             Ok(ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref)))
         };
-        let networks: BTreeSet<_> =
-            schedule.networks().into_iter().map(|network| self.for_device(network)).collect();
-        networks.into_iter().map(record).collect()
+        schedule.networks().into_iter().map(record).collect()
     }
 
-    /// The variant of a network for the device. 8-bit networks are faster on CPUs only.
-    fn for_device(&self, network: Network) -> Network {
-        match (network, self.device) {
-            (Network::FastDvdNetInt8, Device::Gpu | Device::Cuda(_)) => Network::FastDvdNet,
-            _ => network,
-        }
+    /// A schedule with the precision of networks that suits this device.
+    #[must_use]
+    pub fn suited(&self, schedule: Schedule) -> Schedule {
+        if self.device == Device::Cpu { schedule } else { schedule.with_float_networks() }
+    }
+
+    /// The device for a network. GPUs have no operators for 8 bits, and results must not depend on the worker.
+    fn device_for(&self, network: Network) -> Device {
+        if network == Network::FastDvdNetInt8 { Device::Cpu } else { self.device }
     }
 
     /// The contents of the files of a network, in order.
@@ -241,9 +241,12 @@ impl NetworkSource {
         files.iter().map(content).collect()
     }
 
-    /// Name of the execution provider, for records.
-    pub fn provider(&self) -> &'static str {
-        self.device.provider()
+    /// Name of the execution provider of the networks of a schedule, for records: that of the GPU if any runs there. A schedule
+    /// without networks stands for an end-to-end network.
+    pub fn provider(&self, schedule: &Schedule) -> &'static str {
+        let mut devices = schedule.networks().into_iter().map(|network| self.device_for(network));
+        let is_on_cpu = schedule.needs_network() && devices.all(|device| device == Device::Cpu);
+        if is_on_cpu { Device::Cpu.provider() } else { self.device.provider() }
     }
 
     /// The device that runs the networks.
@@ -346,7 +349,8 @@ impl NetworkSource {
 
     /// Loads a network with separate sessions for one thread.
     fn load(&self, network: Network) -> Result<ClipDenoiser, NetworkError> {
-        Ok(ClipDenoiser::load(&self.runtime()?, network, &self.contents(network)?)?)
+        let runtime = Runtime::open(&self.path()?, self.device_for(network))?;
+        Ok(ClipDenoiser::load(&runtime, network, &self.contents(network)?)?)
     }
 
     /// Loads the encoder with a separate session for one thread.
@@ -432,7 +436,6 @@ impl WarmNetworks {
 
 impl Networks for WarmNetworks {
     fn network(&mut self, network: Network) -> Result<&mut dyn Denoiser, ReconError> {
-        let network = self.source.for_device(network);
         let index = match self.loaded.iter().position(|(key, _)| *key == network) {
             Some(index) => index,
             None => {
@@ -527,15 +530,18 @@ mod tests {
     }
 
     #[test]
-    fn gpus_use_floating_point_networks() {
-        let schedule = Algorithm::PnpFastdvdnet.default_schedule();
-        let names = |device| -> Vec<String> {
-            let records = NetworkSource::new(None, device).records(&schedule).unwrap();
-            records.into_iter().map(|record| record.name).collect()
-        };
-        assert_eq!(names(Device::Cpu), ["fastdvdnet-gray", "fastdvdnet-gray-int8"]);
-        assert_eq!(names(Device::Cuda(0)), ["fastdvdnet-gray"]);
-        assert_eq!(names(Device::Gpu), ["fastdvdnet-gray"]);
+    fn the_schedule_decides_the_network_on_every_device() {
+        let algorithm = Algorithm::PnpTvFastdvdnet;
+        for device in [Device::Cpu, Device::Gpu, Device::Cuda(0)] {
+            let source = NetworkSource::new(None, device);
+            let name = |schedule| source.records(&schedule).unwrap().remove(0).name;
+            let (quick, exact) =
+                (algorithm.default_schedule(), algorithm.default_schedule().with_float_networks());
+            assert_eq!(source.provider(&quick), "CPUExecutionProvider");
+            assert_eq!(source.provider(&exact), device.provider());
+            assert_eq!(algorithm.misfit(&exact), None);
+            assert_eq!((&*name(quick), &*name(exact)), ("fastdvdnet-gray-int8", "fastdvdnet-gray"));
+        }
     }
 
     #[test]

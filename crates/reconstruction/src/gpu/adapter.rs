@@ -60,7 +60,10 @@ impl Gpu {
         })?;
         let (info, has) = (adapter.get_info(), adapter.limits());
         let driver = format!("{} {}", info.driver, info.driver_info);
+        // Servers refuse records with longer or other names.
         let name = format!("{} ({})", info.name, driver.trim());
+        let is_plain = |char: &char| char.is_ascii_graphic() || *char == ' ';
+        let name: String = name.chars().filter(is_plain).take(64).collect();
         let required_limits = limits(Limits {
             max_buffer_size: has.max_buffer_size,
             max_storage_buffer_binding_size: has.max_storage_buffer_binding_size,
