@@ -97,7 +97,7 @@ pub(crate) fn run_stage(
 enum Place<'a> {
     Cpu(Box<dyn Prior + 'a>),
     #[cfg(feature = "gpu")]
-    Gpu(Resident),
+    Gpu(Box<Resident>),
 }
 
 impl<'a> Place<'a> {
@@ -116,7 +116,8 @@ impl<'a> Place<'a> {
             let &Stage { iterations, tolerance, .. } = stage;
             let &TvSpec { tv_weight: weight, temporal_weight, tv_updates: updates } = tv;
             let stage = Variation { weight, temporal_weight, updates, iterations, tolerance };
-            return Ok(Self::Gpu(Resident::new(gpu, problem, settings, stage, iterate)?));
+            let resident = Resident::new(gpu, problem, settings, stage, iterate)?;
+            return Ok(Self::Gpu(Box::new(resident)));
         }
         Ok(Self::Cpu(stage.prior.start(problem.operator.dim(), networks)?))
     }

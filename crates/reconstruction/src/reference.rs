@@ -178,7 +178,7 @@ pub(crate) fn variation(frame: &mut [f64], width: usize, tv: &TvSpec) {
     let primal = |down: &[f64], right: &[f64]| -> Vec<f64> {
         let at = |pixel: usize| {
             let above = pixel.checked_sub(width).map_or(0.0, |above| down[above]);
-            let left = if pixel % width > 0 { right[pixel - 1] } else { 0.0 };
+            let left = if pixel.is_multiple_of(width) { 0.0 } else { right[pixel - 1] };
             frame[pixel] - down[pixel] + above - right[pixel] + left
         };
         (0..count).map(at).collect()

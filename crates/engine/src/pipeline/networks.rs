@@ -287,7 +287,7 @@ impl NetworkSource {
     }
 
     /// The GPU that runs the total variation of a schedule, for records. `None` if the CPU does.
-    #[cfg_attr(not(feature = "gpu"), expect(unused_variables, clippy::unused_self))]
+    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
     pub fn gpu_name(&self, schedule: &Schedule) -> Option<String> {
         #[cfg(feature = "gpu")]
         if schedule.stages.iter().any(|stage| matches!(stage.prior, PriorSpec::Tv(_))) {
