@@ -207,7 +207,7 @@ fmt:
 	$(CARGO) fmt --all --check
 
 lint:
-	$(CARGO) clippy --workspace --all-targets -- -D warnings
+	$(CARGO) clippy --workspace --all-targets --features gpu -- -D warnings
 
 # Findings per 1,000 words of the whole repository. Lower it when the rate falls; the aim is 1.0.
 PROSE_RATE ?= 1.0
