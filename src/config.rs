@@ -379,7 +379,8 @@ pub struct EngineArguments {
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
-    /// Device that runs networks: cpu, gpu (the first GPU of any vendor), or cuda:N (NVIDIA, from 0).
+    /// Device that runs networks, and total variation in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
+    /// cuda:N (NVIDIA, from 0; networks only).
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu",
           value_parser = device)]
     pub device: String,

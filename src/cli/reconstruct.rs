@@ -142,6 +142,7 @@ struct Setup {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
+    let schedule = network.suited(schedule);
     let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
@@ -190,8 +191,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let uses_network = setup.model.is_some() || setup.schedule.needs_network();
     let records_version = uses_network && arguments.out.is_some();
     let cost = CostRecord {
-        provider: uses_network.then(|| setup.network.provider().into()),
+        provider: uses_network.then(|| setup.network.provider(&setup.schedule).into()),
         onnxruntime: if records_version { Some(setup.network.version()?) } else { None },
+        gpu: setup.network.gpu_name(&setup.schedule),
         cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };

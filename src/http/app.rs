@@ -128,6 +128,14 @@ impl App {
 pub(super) const WORKER_AGE: Duration = Duration::from_secs(15);
 
 impl App {
+    /// True if a live worker, or those of this service, use a GPU.
+    pub(super) async fn has_gpu(&self) -> Result<bool> {
+        let workers = self.store.live_workers(WORKER_AGE).await?;
+        let devices = workers.iter().filter_map(|worker| worker.place.device.as_deref());
+        let mut devices = devices.chain([&*self.settings.engine.device]);
+        Ok(devices.any(|device| device != "cpu"))
+    }
+
     /// The problem in words if no worker takes tiles. A service that has just started has time to start its workers.
     pub(super) async fn tiles(&self) -> Result<std::result::Result<(), String>> {
         if self.store.live_tile_workers(WORKER_AGE).await? > 0 {

@@ -326,7 +326,7 @@ async fn next_end(app: &App) -> Result<u64> {
 }
 
 /// Resolves a request: checks it against its measurement, and fills in the defaults.
-async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobSpec> {
+async fn resolve(app: &App, access: &Access, mut request: JobRequest) -> Result<JobSpec> {
     let lab = &access.lab;
     let invalid_priority = role_error(access, request.priority);
     let measurement = app.store.measurement(lab, request.measurement).await;
@@ -348,6 +348,12 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
             Some(model.map_err(|error| ApiError::reference("/model", error))?.into())
         }
     };
+    if request.algorithm != Algorithm::Learned && app.has_gpu().await? {
+        // All tiles use one network, on any worker.
+        let schedule = request.schedule.take();
+        let schedule = schedule.unwrap_or_else(|| request.algorithm.default_schedule());
+        request.schedule = Some(schedule.with_float_networks());
+    }
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
     let resolved = resolved.and_then(|spec| spec.with_dispersion(calibration.facts.dispersion));

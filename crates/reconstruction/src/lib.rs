@@ -16,6 +16,8 @@ pub mod error;
 pub mod evidence;
 mod fields;
 mod gap;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod hold_out;
 mod iterate;
 pub mod joints;

@@ -287,9 +287,10 @@ fn tile(
     let cost = CostRecord {
         provider: uses_network.then(|| match task.model {
             Some(_) => model_provider.into(),
-            None => source.provider().into(),
+            None => source.provider(&task.schedule).into(),
         }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
+        gpu: source.gpu_name(&task.schedule),
         cpu_seconds: cpu_seconds() - before + process_seconds,
         peak_rss_bytes: peak_rss_bytes() + process_peak,
     };

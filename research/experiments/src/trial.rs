@@ -157,7 +157,7 @@ impl Bench {
         sequence: Choice,
     ) -> Result<Key, CliError> {
         let (compression_ratio, scale, _) = measured.masks.dim();
-        let schedule = algorithm.default_schedule();
+        let schedule = self.network.suited(algorithm.default_schedule());
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned);
         let snapshots = measured.measurement.dim().0;
         let kind = match sequence {
@@ -185,7 +185,7 @@ impl Bench {
             inputs_sha256: measured.sha256.clone(),
             tile: cut.tile,
             models,
-            provider: deep.then(|| self.network.provider().into()),
+            provider: deep.then(|| self.network.provider(&schedule).into()),
             schedule,
         })
     }

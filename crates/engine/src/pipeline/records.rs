@@ -159,6 +159,9 @@ pub struct CostRecord {
     pub provider: Option<String>,
     /// Version of ONNX Runtime. `None` without a network.
     pub onnxruntime: Option<String>,
+    /// Name and driver of the GPU that ran stages of total variation. `None` if the CPU did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<String>,
     pub cpu_seconds: f64,
     /// Largest resident memory of a computing process.
     pub peak_rss_bytes: u64,
@@ -170,6 +173,7 @@ impl CostRecord {
         parts.fold(Self::default(), |sum, part| Self {
             provider: sum.provider.or_else(|| part.provider.clone()),
             onnxruntime: sum.onnxruntime.or_else(|| part.onnxruntime.clone()),
+            gpu: sum.gpu.or_else(|| part.gpu.clone()),
             cpu_seconds: sum.cpu_seconds + part.cpu_seconds,
             peak_rss_bytes: sum.peak_rss_bytes.max(part.peak_rss_bytes),
         })

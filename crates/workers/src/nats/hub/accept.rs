@@ -229,6 +229,7 @@ impl Known {
             ("assessment", assessment.iter().all(|values| values.fits(frames, (height, width)))),
             ("provider", is_name(&cost.provider)),
             ("onnxruntime", is_name(&cost.onnxruntime)),
+            ("gpu", is_name(&cost.gpu)),
             ("cpu_seconds", (0.0..=seconds).contains(&cost.cpu_seconds)),
             ("peak_rss_bytes", cost.peak_rss_bytes <= MAX_MEMORY),
         ];
