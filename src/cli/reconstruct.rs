@@ -26,7 +26,7 @@ use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Dispersion, Finding, MaskOrder, Mosaic, Registered, RegistrationRequest,
+    Algorithm, Assessment, Dispersion, Finding, Mosaic, Registered, RegistrationRequest,
     SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
 };
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
@@ -648,9 +648,6 @@ impl Report {
             self.stop_reason
         ))?;
         print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
-        if self.assessment.as_ref().and_then(|one| one.order) == Some(MaskOrder::NotVerifiable) {
-            print_line("order of masks not verifiable: the scene moves too little or too fast")?;
-        }
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(

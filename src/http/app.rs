@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::extract::FromRef;
+use quick_cache::sync::Cache;
 use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -12,7 +13,6 @@ use super::context::Wait;
 use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
-use super::quality::{KEPT_QUALITIES, Qualities};
 use super::rate::Rates;
 use super::rendering::Pictures;
 use super::revocation::Revocations;
@@ -20,6 +20,7 @@ use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
 use crate::config::{DeviceState, ServeArguments};
 use engine::job::{Timestamp, TokenId, without_paths};
+use engine::pipeline::quality::Quality;
 use formats::Limits;
 use store::Store;
 
@@ -29,6 +30,9 @@ const READS_AT_ONCE: usize = 4;
 const SESSIONS_PER_MINUTE: u32 = 20;
 /// Requests of a lab that may wait for a file to be read.
 const READS: usize = 32;
+
+/// Number of comparisons that are kept.
+const KEPT_QUALITIES: usize = 1000;
 
 /// What all handlers share; cheap to clone.
 #[derive(Debug, Clone)]
@@ -56,7 +60,8 @@ pub struct Services {
     /// The rate at which each token begins sessions.
     pub(super) session_rates: Rates<TokenId>,
     pub(super) pictures: Pictures,
-    pub(super) qualities: Qualities,
+    /// Comparisons by frames, truth and its reading, because a list of jobs asks for the same ones again and again.
+    pub(super) qualities: Cache<String, Quality>,
     pub(super) machine: Machine,
 }
 
@@ -85,7 +90,7 @@ impl App {
             revocations: Revocations::start(store.clone()),
             session_rates: Rates::new(SESSIONS_PER_MINUTE),
             pictures: Pictures::new(),
-            qualities: Qualities::new(KEPT_QUALITIES),
+            qualities: Cache::new(KEPT_QUALITIES),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),

@@ -5,7 +5,6 @@ use std::path::Path;
 use axum::http::HeaderMap;
 use axum::response::Response;
 use ndarray::Axis;
-use quick_cache::sync::Cache;
 use serde::{Deserialize, Serialize};
 
 use super::conditional;
@@ -19,12 +18,6 @@ use engine::intake::Opened;
 use engine::job::{JobId, SceneShape, Sha256};
 use engine::pipeline::quality::{FrameQuality, Quality};
 use formats::{Axes, Channels, Limits, npy};
-
-/// Comparisons by frames, truth and its reading, because a list of jobs asks for the same ones again and again.
-pub(super) type Qualities = Cache<String, Quality>;
-
-/// Number of comparisons that are kept.
-pub(super) const KEPT_QUALITIES: usize = 1000;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -179,7 +179,7 @@ async fn changes_are_refused_while_the_database_is_missing_or_another() {
     for name in names {
         std::fs::rename(app.data().join(name), aside.join(name)).unwrap();
         refused().await;
-        // A command must not make the file anew, and change what the service does not see.
+        // A command must not create the file: the service would not see its changes.
         let mut create = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         create.args(["token", "--data"]).arg(app.data()).args(["create", "--lab", "a"]);
         let output = create.output().unwrap();

@@ -320,7 +320,7 @@ async fn a_service_starts_on_a_full_disk_and_deletes() {
     app.kill();
     app.restart();
     let reserve = self::reserve(&app).await;
-    // Commands give up the reserve, too: a token must never stay valid for want of room.
+    // Commands give up the reserve, too, so that a token can always be revoked.
     let token = |arguments: &[&str]| {
         let mut token = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         token.args(["token", "--data"]).arg(app.data()).args(arguments).output().unwrap()
@@ -330,7 +330,7 @@ async fn a_service_starts_on_a_full_disk_and_deletes() {
     app.sign_in(String::from_utf8(created.stdout).unwrap().trim());
     let id = app.get("/v1/me").await.expect(200).json()["token"].as_str().unwrap().to_owned();
     fill(&filling);
-    // The write-ahead log has some room of its own; after a few changes it must grow.
+    // The write-ahead log grows after a few changes.
     let mut created = true;
     for _ in 0..100 {
         created = token(&["create", "--lab", "a", "--note", &note]).status.success();

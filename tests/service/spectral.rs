@@ -266,6 +266,7 @@ async fn a_dispersion_that_does_not_fit_is_refused_with_the_expected_size() {
         "sim/masks.npy",
         "--dispersion-offsets",
         "0:2:8",
+        "--json",
     ];
     let output = lab.command(&line);
     let text = String::from_utf8_lossy(&output.stderr).into_owned();
