@@ -104,7 +104,7 @@ async fn jobs_of_a_service_with_a_gpu_use_the_32_bit_network() {
     assert_eq!(done["schedule"]["stages"][1]["prior"], "fastdvdnet", "{done:#}");
     let place = format!("/v1/jobs/{job}/snapshots/0/exports/manifest");
     let manifest = app.get(&place).await.expect(200).json();
-    let models = manifest["models"].as_array().unwrap();
+    let models = manifest["content"]["models"].as_array().unwrap();
     assert_eq!((models.len(), &models[0]["name"]), (1, &json!("fastdvdnet-gray")), "{manifest}");
     assert_eq!(manifest["run"]["provider"], "WebGpuExecutionProvider");
     let gpu = manifest["run"]["gpu"].as_str().unwrap_or_default();
