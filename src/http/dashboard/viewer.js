@@ -221,14 +221,18 @@ export class Viewer {
       this.right.setNote("There is only one frame.");
       return;
     }
+    // A late answer must not undo a newer one.
+    const turn = (this.turn = (this.turn ?? 0) + 1);
     try {
       const spread = await this.spread();
+      if (turn !== this.turn) return;
       Object.assign(this, { levels: spread.levels, tile: spread.tile });
       this.view.resize(spread.height, spread.width);
       say(this.meaning, MODES.find(([value]) => value === this.mode())[3]);
       this.rightContrast.offer(spread);
       this.distribute(this.rightContrast, `${this.base()}/${this.name(Math.ceil(this.player.count / 2))}`, spread, this.right.generation);
     } catch (error) {
+      if (turn !== this.turn) return;
       if (!error.errors || isUnreachable(error)) throw error;
       this.ready = false;
       this.right.show(null);
