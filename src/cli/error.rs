@@ -60,15 +60,12 @@ impl CliError {
     }
 }
 
-/// Opens a file that the user names. Opening a pipe would wait for its writer.
+/// Opens a file that the user names.
 pub fn open_input(path: &Path) -> Result<File> {
-    let meta = path.metadata().map_err(|error| CliError::file("read", path, &error))?;
-    let fault = match meta.file_type() {
-        kind if kind.is_dir() => "is a folder; pack its pictures into a zip or tar archive",
-        kind if !kind.is_file() => "is not a regular file",
-        _ => return File::open(path).map_err(|error| CliError::file("read", path, &error)),
-    };
-    Err(CliError::Input(format!("{} {fault}", path.display())))
+    formats::open_file(path).map_err(|error| match error {
+        FormatError::Io { source, .. } => CliError::file("read", path, &source),
+        other => CliError::Input(format!("{}: {other}", path.display())),
+    })
 }
 
 impl From<ReconError> for CliError {

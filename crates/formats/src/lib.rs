@@ -53,7 +53,7 @@ pub use error::{DiskTrouble, FormatError, Lightless};
 pub use format::Format;
 pub use limits::Limits;
 pub use natural::natural_key;
-pub use open::{Wanted, collect, open_array, open_shown, open_stack, read_stack};
+pub use open::{Wanted, collect, open_array, open_file, open_shown, open_stack, read_stack};
 pub use part::{Crop, Packing, Part};
 pub use samples::StackWriter;
 pub use stack::{FrameReader, Frames, FullScale, SampleType, StackInfo};

@@ -265,29 +265,35 @@ pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Arra
     Ok((info, stack))
 }
 
-/// Opens a file, and determines its length and format. `name` is the array that an error mentions.
-pub(super) fn open(path: &Path, name: &str) -> Result<(File, u64, Format)> {
-    // Opening a pipe would wait for its writer.
-    let metadata = path.metadata().map_err(FormatError::io("open the file"))?;
-    if metadata.is_dir() {
-        return Err(unknown(
-            "it is a folder; pack its pictures into a zip or tar archive".to_owned(),
-        ));
+/// Opens a regular file. Opening a pipe would wait for its writer.
+///
+/// Errors: I/O; [`FormatError::UnknownFormat`] for folders, pipes and devices.
+pub fn open_file(path: &Path) -> Result<File> {
+    let kind = path.metadata().map_err(FormatError::io("open the file"))?.file_type();
+    if kind.is_dir() {
+        let found = "it is a folder; pack its pictures into a zip or tar archive";
+        return Err(unknown(found.to_owned()));
     }
-    if !metadata.is_file() {
+    if !kind.is_file() {
         return Err(unknown("it is not a regular file".to_owned()));
     }
-    let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
-    if metadata.len() == 0 {
+    File::open(path).map_err(FormatError::io("open the file"))
+}
+
+/// Opens a file, and determines its length and format. `name` is the array that an error mentions.
+pub(super) fn open(path: &Path, name: &str) -> Result<(File, u64, Format)> {
+    let mut file = open_file(path)?;
+    let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
+    if length == 0 {
         return Err(unknown("it is empty".to_owned()));
     }
     let head = head(&mut file)?;
     let format = match Format::sniff(&head) {
         Some(format) => format,
-        None if has_user_block(&file, metadata.len())? => Format::Hdf5,
+        None if has_user_block(&file, length)? => Format::Hdf5,
         None => return Err(unknown(describe(&head, &hdf5::python_name(name)))),
     };
-    Ok((file, metadata.len(), format))
+    Ok((file, length, format))
 }
 
 /// The first bytes of a file.

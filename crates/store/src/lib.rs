@@ -263,7 +263,7 @@ impl Store {
         Ok(transaction.rollback().await?)
     }
 
-    /// Errors: [`StoreError::DatabaseGone`] if the file of the database was removed or replaced since it was opened.
+    /// Errors: [`StoreError::DatabaseGone`] if a file of the database was removed, replaced or truncated since it was opened.
     pub fn check_database_file(&self) -> Result<()> {
         self.files.check(&self.dir.database())
     }

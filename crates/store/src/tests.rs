@@ -6,6 +6,7 @@ mod failures;
 mod keeping;
 mod migration;
 mod movies;
+mod notifications;
 mod remote;
 mod sequences;
 mod statements;

@@ -30,7 +30,7 @@ const capital = (text) => text.replace(/^./, (letter) => letter.toUpperCase());
 export class Viewer {
   constructor(job, signal) {
     const { frames, height, width } = job.shape;
-    Object.assign(this, { job, signal, snapshot: job.snapshots.first, spreads: new Map() });
+    Object.assign(this, { job, signal, snapshot: job.snapshots.first, spreads: new Map(), turn: 0 });
     this.view = new View(height, width);
     const spectral = job.dispersion !== null;
     this.right = new Pane(spectral ? "Bands" : "Frames", this.view, signal);
@@ -222,7 +222,7 @@ export class Viewer {
       return;
     }
     // A late answer must not undo a newer one.
-    const turn = (this.turn = (this.turn ?? 0) + 1);
+    const turn = (this.turn += 1);
     try {
       const spread = await this.spread();
       if (turn !== this.turn) return;

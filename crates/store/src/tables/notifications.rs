@@ -50,8 +50,8 @@ impl Store {
                 FROM notifications n JOIN jobs ON jobs.id = n.job WHERE n.next_at <= ?1
             ) WHERE turn <= ?2 ORDER BY turn, next_at, id LIMIT ?3";
         let (now, most) = (Timestamp::now(), most as u64);
-        let due = sql_as!(DUE, [now, most_of_lab, most]).fetch_all(&self.readers).await?;
-        let due: Vec<Notification> = due;
+        let due: Vec<Notification> =
+            sql_as!(DUE, [now, most_of_lab, most]).fetch_all(&self.readers).await?;
         if due.is_empty() {
             return Ok(due);
         }
