@@ -7,7 +7,7 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ndarray::Array3;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use reconstruction::operator::SensingOperator;
 use reconstruction::priors::nonlocal::{Nonlocal, Part};
 use reconstruction::priors::temporal::TemporalVariation;
@@ -23,7 +23,7 @@ const LANES: usize = 16;
 const CHAINS: usize = 10;
 
 fn random(seed: u64) -> Array3<f32> {
-    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(seed);
     Array3::from_shape_fn(DIM, |_| rng.random::<f32>())
 }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use hmac::{Hmac, Mac};
+use hmac::{Hmac, KeyInit, Mac};
 use reqwest::redirect::Policy;
 use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
@@ -42,7 +42,7 @@ const PAUSES: [Duration; 9] = [
 /// Sends notifications until it is dropped. `allowed` are the hosts that the administrator allows.
 pub async fn send(store: Store, allowed: Vec<String>) {
     // A redirection could lead to a host that is not allowed.
-    let client = Client::builder().timeout(TIMEOUT).redirect(Policy::none()).build();
+    let client = crate::http_client().timeout(TIMEOUT).redirect(Policy::none()).build();
     let client = match client {
         Ok(client) => client,
         Err(error) => {

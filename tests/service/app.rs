@@ -142,7 +142,7 @@ impl TestApp {
         let data = folder.path().join(subfolder);
         let (arguments, token) = (owned(arguments), std::sync::RwLock::default());
         // A server that stops answering fails the test.
-        let client = Client::builder().read_timeout(LONGEST_SILENCE).build().unwrap();
+        let client = sci_recon::http_client().read_timeout(LONGEST_SILENCE).build().unwrap();
         Self { _folder: folder, data, process, url, client, arguments, token }
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use serde_json::{Value, json};
 
 use crate::app::TestApp;
@@ -112,7 +112,7 @@ async fn random_kills_change_no_result() {
 
     let seed: u64 = rand::random();
     eprintln!("seed of the kills: {seed}");
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut random = rand::rngs::ChaCha8Rng::seed_from_u64(seed);
     let mut jobs = vec![app.submit(&job(&measurement)).await];
     let (mut servers, mut while_running) = (0, 0);
     for kill in 0..kills {

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use rand::{Rng, RngCore, SeedableRng};
+use rand::{Rng, RngExt, SeedableRng};
 use reqwest::{Method, RequestBuilder};
 use serde_json::{Value, json};
 use store::{Purpose, Store};
@@ -373,7 +373,7 @@ async fn raw_piece(
 async fn repeated_pieces_lose_no_byte() {
     let (rounds, seed) = (kills().max(20), rand::random::<u64>());
     eprintln!("seed of the repeats: {seed}");
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut random = rand::rngs::ChaCha8Rng::seed_from_u64(seed);
     let mut app = TestApp::start().await;
     let (mut repeats, mut servers, mut lost, mut wrong) = (0, 0, 0, 0);
     for round in 0..rounds {

@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use serde_json::{Value, json};
 
 use crate::app::TestApp;
@@ -55,7 +55,7 @@ fn reconstruct((a, b): (f32, f32), (full_a, full_b): (f32, f32)) -> (Value, Vec<
 
 /// Random factors from 1e-4 to 1e6, evenly spread over the magnitudes.
 fn factors(seed: u64) -> impl Iterator<Item = f32> {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+    let mut random = rand::rngs::ChaCha8Rng::seed_from_u64(seed);
     std::iter::repeat_with(move || 10f32.powf(random.random_range(-4.0..6.0)))
 }
 

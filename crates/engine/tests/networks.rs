@@ -5,7 +5,7 @@
 use std::path::PathBuf;
 
 use ndarray::{Array3, ArrayView3, s};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use reconstruction::priors::network::ClipDenoiser;
 use reconstruction::priors::onnx::{Device, Runtime};
 use reconstruction::priors::{CHANNELS, Denoiser, Network, Networks};
@@ -30,7 +30,7 @@ fn load(which: Network) -> Option<ClipDenoiser> {
 }
 
 fn noisy(frames: usize, height: usize, width: usize) -> (Array3<f32>, Array3<f32>) {
-    let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+    let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(9);
     let clean = Array3::from_shape_fn((frames, height, width), |(k, i, j)| {
         0.5 + 0.3 * ((i + 2 * k) as f32 * 0.15).sin() * (j as f32 * 0.1).cos()
     });

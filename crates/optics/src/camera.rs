@@ -1,7 +1,7 @@
 //! A camera model: shot noise, read noise, background, saturation and bit depth.
 
 use ndarray::{Array2, ArrayView2};
-use rand::Rng;
+use rand::RngExt;
 use rand_distr::{Distribution, Normal, Poisson};
 use serde::{Deserialize, Serialize};
 
@@ -86,7 +86,7 @@ impl Camera {
         &self,
         light: ArrayView2<'_, f32>,
         background: f64,
-        rng: &mut impl Rng,
+        rng: &mut impl RngExt,
     ) -> Result<Array2<u16>> {
         self.check()?;
         let read = Normal::new(0.0, self.read_noise_e).map_err(|error| impossible(&error))?;

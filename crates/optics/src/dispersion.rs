@@ -348,7 +348,7 @@ mod tests {
     use super::{Dispersion, DispersionAxis, MaskExtent};
     use crate::{generator, iid_masks};
     use ndarray::{Array2, s};
-    use rand::Rng;
+    use rand::RngExt;
 
     fn dispersion(axis: DispersionAxis, offsets: &[f64]) -> Dispersion {
         let offsets = offsets.to_vec();

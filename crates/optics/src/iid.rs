@@ -1,7 +1,7 @@
 //! Independent random binary masks, as in the public benchmark.
 
 use ndarray::Array3;
-use rand::Rng;
+use rand::RngExt;
 
 use super::{Result, check_size, generator};
 

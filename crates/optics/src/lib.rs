@@ -89,7 +89,7 @@ pub enum OpticsError {
 }
 
 /// The random number generator of this crate. It gives the same numbers on every machine.
-pub fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
+pub fn generator(seed: u64) -> rand::rngs::ChaCha8Rng {
     rand::SeedableRng::seed_from_u64(seed)
 }
 

@@ -1,7 +1,7 @@
 //! The masks of a hybrid coded aperture, computed from its patterns.
 
 use ndarray::{Array2, Array3, ArrayView3, Axis};
-use rand::Rng;
+use rand::RngExt;
 
 use super::projection::centre;
 use super::{Geometry, Method, OpticsError, Placement, Projector, Result, check_patterns};
@@ -64,7 +64,7 @@ impl HybridAperture {
         &self,
         patterns: ArrayView3<'_, f32>,
         size: (usize, usize),
-        rng: &mut impl Rng,
+        rng: &mut impl RngExt,
     ) -> Result<ProjectedMasks> {
         let (frames, rows, columns) = patterns.dim();
         check_patterns(patterns, frames)?;
@@ -97,7 +97,7 @@ impl HybridAperture {
     fn lithography(
         &self,
         (rows, columns): (usize, usize),
-        rng: &mut impl Rng,
+        rng: &mut impl RngExt,
     ) -> Result<Array2<f32>> {
         let Some(given) = &self.lithography else {
             return Ok(Array2::from_shape_simple_fn((rows, columns), || {

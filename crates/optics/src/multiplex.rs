@@ -1,6 +1,6 @@
 //! Multiplexing matrices: which sub-apertures are open in which frame.
 
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::index;
 
 use super::{OpticsError, Result, check_parameter};
@@ -52,7 +52,12 @@ impl Multiplexing {
     ///
     /// Errors: [`OpticsError::Parameter`] or [`OpticsError::Pattern`] for impossible options, [`OpticsError::Rank`] if
     /// no draw has the required rank.
-    pub fn random(frames: usize, apertures: usize, draw: Draw, rng: &mut impl Rng) -> Result<Self> {
+    pub fn random(
+        frames: usize,
+        apertures: usize,
+        draw: Draw,
+        rng: &mut impl RngExt,
+    ) -> Result<Self> {
         let wanted = draw.required_rank(frames, apertures)?;
         let Draw { open, tries, .. } = draw;
         let mut reached = 0;
@@ -66,7 +71,7 @@ impl Multiplexing {
         Err(OpticsError::Rank { tries, frames, open, apertures, reached, wanted })
     }
 
-    fn draw(frames: usize, apertures: usize, open: usize, rng: &mut impl Rng) -> Self {
+    fn draw(frames: usize, apertures: usize, open: usize, rng: &mut impl RngExt) -> Self {
         let pattern = |rng: &mut _| {
             let mut row = vec![false; apertures];
             index::sample(rng, apertures, open).into_iter().for_each(|i| row[i] = true);

@@ -2,7 +2,7 @@
 //! cells divide the LCoS evenly.
 
 use ndarray::{Array3, ArrayView3};
-use rand::Rng;
+use rand::RngExt;
 use rand::seq::index;
 use serde::{Deserialize, Serialize};
 
@@ -60,7 +60,7 @@ impl Multiplexing {
 pub fn single_apertures(
     frames: usize,
     grid: ApertureGrid,
-    rng: &mut impl Rng,
+    rng: &mut impl RngExt,
 ) -> Result<Array3<f32>> {
     check_size(frames, grid.rows, grid.columns)?;
     if frames > grid.count() {

@@ -1,7 +1,7 @@
 //! Hold-out pixels of a measurement, by which the frames of a reconstruction without them are judged.
 
 use ndarray::{Array3, ArrayView3, Axis, s};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use serde::{Deserialize, Serialize};
 
 use super::operator::SensingOperator;
@@ -22,7 +22,7 @@ impl HoldOut {
         let gram = op.gram();
         let mut pixels = Vec::new();
         for snapshot in 0..op.snapshots() {
-            let mut random = rand_chacha::ChaCha8Rng::seed_from_u64((first + snapshot) as u64);
+            let mut random = rand::rngs::ChaCha8Rng::seed_from_u64((first + snapshot) as u64);
             for ((row, column), _) in gram.indexed_iter() {
                 if random.random_bool(SHARE) && op.uses((snapshot, row, column)) {
                     pixels.push((snapshot, row, column));

@@ -538,8 +538,8 @@ mod tests {
     use proptest::prelude::{any, proptest};
 
     fn random(seed: u64, dim: (usize, usize, usize)) -> Array3<f32> {
-        use rand::{Rng, SeedableRng};
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        use rand::{RngExt, SeedableRng};
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(seed);
         Array3::from_shape_fn(dim, |_| rng.random::<f32>())
     }
 
@@ -682,11 +682,11 @@ mod tests {
         use rand::SeedableRng;
         // <H x, y> = <x, H^T y>, with masks of the whole chain of optics.
         let (masks, _) = optics::random_squares(4, 12, 9, 3).unwrap();
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(8);
         let frames =
-            Array3::from_shape_simple_fn((4, 12, 9), || rand::Rng::random::<f32>(&mut rng));
+            Array3::from_shape_simple_fn((4, 12, 9), || rand::RngExt::random::<f32>(&mut rng));
         let y = ndarray::Array2::from_shape_simple_fn((12, 9), || {
-            rand::Rng::random::<f32>(&mut rng) - 0.5
+            rand::RngExt::random::<f32>(&mut rng) - 0.5
         });
         let forward = optics::measure(masks.view(), frames.view()).unwrap();
         let op = SensingOperator::new(masks).unwrap();

@@ -382,7 +382,7 @@ mod tests {
     use crate::stage::Stage;
     use ndarray::{Array2, Array3, Axis};
     use optics::{iid_masks, measure};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
     use std::ops::Range;
 
     /// Moves towards the true frames in some iterations, counted from 1, and away from them in the others.
@@ -476,7 +476,7 @@ mod tests {
     }
 
     fn still_texture() -> Array3<f32> {
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        let mut random = rand::rngs::ChaCha8Rng::seed_from_u64(5);
         // Too fine for the filter of groups.
         let texture = Array2::from_shape_simple_fn((64, 64), || random.random::<f32>());
         Array3::from_shape_fn((6, 64, 64), |(_, i, j)| texture[[i, j]])
@@ -634,7 +634,7 @@ mod tests {
     fn noise_brings_a_noise_term() {
         let masks = iid_masks(6, 64, 64, 3).unwrap();
         let y = measure(masks.view(), drifting_wave(2.0).view()).unwrap().insert_axis(Axis(0));
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        let mut random = rand::rngs::ChaCha8Rng::seed_from_u64(3);
         let noise = y.mapv(|_| (0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0);
         let op = SensingOperator::new(masks).unwrap();
         let gamma = |schedule: &Schedule, sigma: f32| {

@@ -107,12 +107,12 @@ mod tests {
     use crate::operator::{SensingOperator, Statistics};
     use crate::schedule::Schedule;
     use ndarray::Array3;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     /// Projection and total variation strip by strip equal those of whole frames, bit by bit.
     #[test]
     fn strips_equal_whole_frames() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(8);
         // Wide enough for several strips.
         let size = (3, 50, 1100);
         let mut random = || Array3::from_shape_simple_fn(size, || rng.random::<f32>());

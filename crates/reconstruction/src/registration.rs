@@ -9,7 +9,7 @@
 use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis, s};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 
 use super::crop;
 use super::error::{ReconError, Result, shape_text};
@@ -151,7 +151,7 @@ pub fn register(
 
 /// Draws two sets of hold-out pixels of a measurement \[1,h,w\]. No pixel is in both.
 fn draw(y: &Array3<f32>) -> [HoldOut; 2] {
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(0);
+    let mut random = rand::rngs::ChaCha8Rng::seed_from_u64(0);
     let mut draws = [Vec::new(), Vec::new()];
     for (pixel, value) in y.indexed_iter() {
         let draw = (random.random::<f64>() / SHARE) as usize;

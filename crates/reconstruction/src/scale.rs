@@ -52,10 +52,10 @@ impl ScaleEstimator {
 mod tests {
     use super::ScaleEstimator;
     use ndarray::{Array2, Array3, Axis};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     fn scene(factor: f32) -> (Array3<f32>, Array2<f32>) {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(5);
         let masks =
             Array3::from_shape_fn((8, 64, 64), |_| f32::from(u8::from(rng.random::<bool>())));
         let mut y = Array2::zeros((64, 64));

@@ -189,11 +189,11 @@ mod tests {
     use crate::operator::SensingOperator;
     use ndarray::Array3;
     use optics::iid_masks;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
     use rand_distr::StandardNormal;
 
-    fn random() -> rand_chacha::ChaCha8Rng {
-        rand_chacha::ChaCha8Rng::seed_from_u64(4)
+    fn random() -> rand::rngs::ChaCha8Rng {
+        rand::rngs::ChaCha8Rng::seed_from_u64(4)
     }
 
     #[test]

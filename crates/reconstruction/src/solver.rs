@@ -191,11 +191,11 @@ mod tests {
     use crate::operator::SensingOperator;
     use crate::schedule::Schedule;
     use ndarray::{Array3, ArrayView3, Axis, s};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     #[test]
     fn a_stage_run_twice_is_the_blend_of_its_runs() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(9);
         let masks = Array3::from_shape_simple_fn((5, 48, 48), || rng.random::<f32>());
         // Fine texture that is static on the left and moves on the right.
         let texture: Vec<f32> = (0..48 * 60).map(|_| rng.random()).collect();
@@ -253,7 +253,7 @@ mod tests {
     /// If no prior looks along time, a run of snapshots gives the same bits as each snapshot alone.
     #[test]
     fn snapshots_are_independent_if_no_prior_looks_along_time() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(9);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(9);
         let masks = Array3::from_shape_simple_fn((4, 40, 24), || rng.random::<f32>());
         let y = Array3::from_shape_simple_fn((3, 40, 24), || 2.0 * rng.random::<f32>());
         let solve = |y: ArrayView3<'_, f32>, schedule: &Schedule| {

@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::Args;
-use rand::Rng;
+use rand::RngExt;
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde_json::Value;
 
@@ -114,7 +114,7 @@ impl Client {
         if !["http", "https"].contains(&parsed.scheme()) {
             return Err(wrong(&"it must begin with http:// or https://"));
         }
-        let http = reqwest::Client::builder()
+        let http = crate::http_client()
             .connect_timeout(Duration::from_secs(10))
             .tcp_keepalive(Duration::from_secs(30))
             // The check of a large file takes minutes.

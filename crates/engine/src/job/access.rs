@@ -3,9 +3,9 @@
 use std::fmt;
 use std::str::FromStr;
 
-use rand::TryRngCore;
-use rand::rand_core::OsError;
-use rand::rngs::OsRng;
+use rand::TryRng;
+use rand::rngs::{SysError, SysRng};
+
 use serde::Serialize;
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
@@ -72,9 +72,9 @@ impl Secret {
     /// Generates a new secret.
     ///
     /// Errors: the operating system provides no random numbers.
-    pub fn random() -> Result<Self, OsError> {
+    pub fn random() -> Result<Self, SysError> {
         let mut bytes = [0; 32];
-        OsRng.try_fill_bytes(&mut bytes)?;
+        SysRng.try_fill_bytes(&mut bytes)?;
         Ok(Self::from_bytes(bytes))
     }
 

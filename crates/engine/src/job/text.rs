@@ -1,7 +1,7 @@
 //! Validated text values: labels, hashes and times, and the errors of invalid ones.
 
 use std::fmt;
-use std::io::{self, BufReader, Read};
+use std::io::{self, BufRead, BufReader, Read};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -130,8 +130,23 @@ impl Sha256 {
     pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
         use sha2::Digest;
         let mut hasher = sha2::Sha256::new();
-        let size = io::copy(&mut BufReader::with_capacity(256 * 1024, reader), &mut hasher)?;
-        Ok((Self(hasher.finalize().into()), size))
+        let mut reader = BufReader::with_capacity(256 * 1024, reader);
+        let mut size = 0;
+        loop {
+            let length = match reader.fill_buf() {
+                Ok(bytes) => {
+                    hasher.update(bytes);
+                    bytes.len()
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                Err(error) => return Err(error),
+            };
+            if length == 0 {
+                return Ok((Self(hasher.finalize().into()), size));
+            }
+            reader.consume(length);
+            size += length as u64;
+        }
     }
 
     /// The hash of these bytes.

@@ -1,5 +1,5 @@
 use ndarray::{Array2, array};
-use rand::Rng;
+use rand::RngExt;
 
 use super::{Method, Placement, Projector, centre};
 use crate::{Geometry, generator};

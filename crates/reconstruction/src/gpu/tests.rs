@@ -4,8 +4,8 @@ use std::process::Command;
 use std::sync::{Arc, OnceLock};
 
 use ndarray::{Array3, s};
-use rand::{Rng, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
 use serde_json::json;
 use wgpu::Limits;
 

@@ -95,10 +95,10 @@ fn update(values: &[Lanes], dual: &mut [Lanes], weight: f32) {
 mod tests {
     use super::TemporalVariation;
     use ndarray::{Array3, Axis, s};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     fn random(size: (usize, usize, usize)) -> Array3<f32> {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(1);
         Array3::from_shape_simple_fn(size, || rng.random())
     }
 

@@ -370,11 +370,11 @@ mod tests {
     use super::{TotalVariation, TvSpec};
     use crate::reference::{max_difference, variation};
     use ndarray::{Array3, Axis};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     #[test]
     fn fast_kernel_equals_the_reference() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(1);
         for (h, w) in [(1, 1), (1, 7), (9, 1), (2, 2), (17, 33), (40, 64)] {
             let frames = Array3::from_shape_fn((2, h, w), |_| rng.random::<f32>());
             for updates in [1, 2, 4, 20] {
@@ -391,7 +391,7 @@ mod tests {
 
     #[test]
     fn strips_of_any_height_give_the_same_frames() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(3);
         for (height, updates) in [(1, 4), (3, 4), (23, 4), (40, 7)] {
             let frames = Array3::from_shape_fn((2, height, 19), |_| rng.random::<f32>());
             let mut whole = frames.clone();
@@ -419,7 +419,7 @@ mod tests {
         TotalVariation::new((1, 8, 8)).denoise(&mut flat, 0.1, 10);
         assert!(flat.iter().all(|&x| (x - 0.4).abs() < 1e-6));
 
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(2);
         let mut noisy = Array3::from_shape_fn((1, 32, 32), |_| 0.5 + 0.1 * rng.random::<f32>());
         let before = noisy.index_axis(Axis(0), 0).var(0.0);
         TotalVariation::new((1, 32, 32)).denoise(&mut noisy, 0.1, 20);

@@ -10,7 +10,7 @@ use crate::priors::{Denoiser, Network, Networks};
 use crate::schedule::Schedule;
 use crate::solver::reconstruct;
 use ndarray::Array3;
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use serde_json::json;
 use std::f64::consts::PI;
 
@@ -44,13 +44,17 @@ impl Networks for Pull {
 
 impl Problem {
     pub(crate) fn random(seed: u64, method: &str) -> Self {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(seed);
         let size = (rng.random_range(1..5), rng.random_range(1..8), rng.random_range(1..40));
         Self::with_size(size, rng, method)
     }
 
     /// A problem with masks of this size.
-    pub(crate) fn with_size(size: (usize, usize, usize), mut rng: impl Rng, method: &str) -> Self {
+    pub(crate) fn with_size(
+        size: (usize, usize, usize),
+        mut rng: impl RngExt,
+        method: &str,
+    ) -> Self {
         let masks = Array3::from_shape_simple_fn(size, || 0.2 + 0.8 * rng.random::<f32>());
         let snapshots = rng.random_range(1..4);
         let y = (snapshots, size.1, size.2);

@@ -1,7 +1,7 @@
 //! Tables `notifications` and `webhook_secrets`. A trigger adds a notification when a job with a webhook ends, in the same
 //! transaction.
 
-use rand::Rng;
+use rand::RngExt;
 
 use super::jobs::Job;
 use crate::Store;

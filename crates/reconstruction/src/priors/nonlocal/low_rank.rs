@@ -327,7 +327,7 @@ mod tests {
     use super::super::layout::place_of;
     use super::{BATCH, Filter, PATCHES, PIXELS, factorize, multiply, solve};
     use pulp::{Arch, Simd, WithSimd};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     type Patches = Vec<[f32; PATCHES]>;
 
@@ -387,7 +387,7 @@ mod tests {
     /// Each eigenvector `e` of `G = Y Y^T` with the eigenvalue `l` keeps the share `l^2 / (l^2 + tau^2)`.
     #[test]
     fn the_filter_is_that_of_the_eigenvalues() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(7);
         let tau = 0.9;
         let mut groups = vec![vec![[0.0; PATCHES]; PIXELS]; BATCH];
         for group in &mut groups {

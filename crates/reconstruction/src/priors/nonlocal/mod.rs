@@ -366,10 +366,10 @@ mod tests {
     use super::{Nonlocal, OUTLIER_LIMIT, REFRESH, STRENGTH, limit_outliers, temporal_shrinkage};
     use ndarray::{Array2, Array3};
     use pulp::Arch;
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
 
     fn noisy(size: (usize, usize, usize), sigma: f32) -> (Array3<f32>, Array3<f32>) {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(5);
         let clean = Array3::from_shape_fn(size, |(k, i, j)| {
             0.5 + 0.3 * ((i + 2 * k) as f32 * 0.25).sin() * ((j + k) as f32 * 0.2).cos()
         });
@@ -598,7 +598,7 @@ mod tests {
     #[test]
     fn patches_are_found_along_their_motion() {
         let size = (6, 72, 96);
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(6);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(6);
         let fine = Array2::from_shape_fn((120, 120), |_| rng.random::<f32>());
         let mut video = Array3::from_shape_fn(size, |(k, i, j)| {
             let (i, j) = (i + 40 - 6 * k, j + 3 * k);

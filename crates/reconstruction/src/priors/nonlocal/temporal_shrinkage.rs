@@ -121,7 +121,7 @@ fn excess<'a>(
 pub(super) mod tests {
     use super::{RADIUS, TemporalShrinkage};
     use ndarray::{Array3, Axis};
-    use rand::{Rng, SeedableRng};
+    use rand::{RngExt, SeedableRng};
     use std::f64::consts::PI;
 
     /// Coefficient by coefficient and pixel by pixel, in 64 bits.
@@ -152,7 +152,7 @@ pub(super) mod tests {
 
     #[test]
     fn changes_are_those_of_the_reference() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(2);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(2);
         for (size, margin) in [((7, 9, 13), 0), ((2, 3, 4), 5), ((1, 6, 6), 1), ((5, 1, 2), 3)] {
             // The changes fall from left to right, from far above the level to below it.
             let clip = Array3::from_shape_fn(size, |(_, _, j)| {
@@ -176,7 +176,7 @@ pub(super) mod tests {
 
     #[test]
     fn coefficients_far_above_the_level_stay_and_those_far_below_vanish() {
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(4);
+        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(4);
         let clip = Array3::from_shape_simple_fn((6, 12, 12), || rng.random::<f32>());
         for (level, share) in [(1e-3, 1.0), (30.0, 0.0), (f32::MIN_POSITIVE, 1.0)] {
             let mut flat = clip.clone().into_raw_vec_and_offset().0;
