@@ -111,7 +111,7 @@ async fn a_job_on_a_gpu_gives_the_frames_of_the_cpu() {
     assert_eq!(manifest["run"]["provider"], "WebGpuExecutionProvider");
     let gpu = manifest["run"]["gpu"].as_str().unwrap_or_default();
     assert_eq!(gpu.contains("SwiftShader"), cfg!(feature = "gpu"), "{manifest}");
-    let computed = values(&app.get(&export("npy")).await.expect(200).body);
+    let computed = values(&app.get(&export("npy")).await.expect(200).bytes);
 
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
