@@ -142,11 +142,11 @@ impl Motion {
             }
             best
         };
-        let mut of_cells = Array2::default((rows, columns));
-        cores.share(of_cells.outer_iter_mut().enumerate(), |(row, mut cells)| {
+        let mut motions = Array2::default((rows, columns));
+        cores.share(motions.outer_iter_mut().enumerate(), |(row, mut cells)| {
             cells.indexed_iter_mut().for_each(|(column, cell)| *cell = motion_at(row, column));
         });
-        Self { of_cells }
+        Self { of_cells: motions }
     }
 
     /// The motion at this pixel.

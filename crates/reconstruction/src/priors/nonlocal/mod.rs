@@ -135,7 +135,8 @@ const OUTLIER_LIMIT: f32 = 4.0;
 /// Number of batches that several cores filter before their patches are accumulated: enough that the cores rarely wait for
 /// each other. The patches then take 6 MB.
 const BATCHES_AT_ONCE: usize = 64;
-/// One of so many patches is examined to divide the accumulation among cores.
+/// Step between the patches by which the accumulation is divided among cores. It is prime, so that it meets all places of a
+/// group.
 const SAMPLE_STEP: usize = 61;
 
 /// The prior with its groups and working memory, for clips of one size.
@@ -253,8 +254,8 @@ impl Nonlocal {
         groups.resize(lines.iter().map(Line::len).sum::<usize>() * PATCHES, 0);
         let mut rest = groups.as_mut_slice();
         let parts = lines.iter().map(|line| {
-            let of_line = rest.split_off_mut(..line.len() * PATCHES).unwrap_or_default();
-            (line, of_line)
+            let slots = rest.split_off_mut(..line.len() * PATCHES).unwrap_or_default();
+            (line, slots)
         });
         let clip = (guide.as_slice(), size);
         let mut memories: Vec<Best> = (0..cores.count()).map(|_| Best::default()).collect();

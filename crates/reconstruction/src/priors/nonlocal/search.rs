@@ -32,13 +32,13 @@ impl Line {
 
 /// All rows of reference patches. Their grid depends on the number of earlier searches.
 pub(super) fn lines((frames, height, width): Size, searches: usize) -> Vec<Line> {
-    let of_frame = |frame| {
+    let frame_lines = |frame| {
         let (down, right) = shift(frame, searches);
         let columns = positions(width, right);
         let line = move |row| Line { frame, row, columns: columns.clone() };
         positions(height, down).into_iter().map(line)
     };
-    (0..frames).flat_map(of_frame).collect()
+    (0..frames).flat_map(frame_lines).collect()
 }
 
 /// Finds the patches most similar to each reference patch of a line, near it in time and near the place where its motion
@@ -73,9 +73,9 @@ fn search_with<S: Simd, const V: usize>(
 ) {
     let row_length = row_length(width);
     let plane = height * row_length;
-    let near = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
+    let reach = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
     // The reference's frame first: it probably has the most similar patches, and the bound falls at once.
-    let order = || [frame].into_iter().chain(near.clone().filter(|&other| other != frame));
+    let order = || [frame].into_iter().chain(reach.clone().filter(|&other| other != frame));
     for (&column, group) in columns.iter().zip(groups.chunks_exact_mut(PATCHES)) {
         let motion = motion.at(row + SIDE / 2, column + SIDE / 2);
         let rows_in = |k: usize| window(moved(row, motion.0, frame, k), height);
