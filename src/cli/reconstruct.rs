@@ -109,7 +109,7 @@ pub struct Arguments {
     /// ffdnet-gray/model.onnx. The manifest has their hashes.
     #[arg(long, value_name = "FOLDER")]
     models: Option<PathBuf>,
-    /// Tiles solved at the same time [default: the number of cores].
+    /// Cores to use [default: all]. Each tile has one, and the tiles at work share those that are left.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     /// Largest side of a tile in pixels (with --mosaic, of a sub-image) [default: 320; 384 for TV alone; 240 where

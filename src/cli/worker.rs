@@ -29,6 +29,8 @@ use workers::{Local, ModelCommand, Worker, WorkerError};
 pub fn run(settings: &WorkerArguments) -> Result<()> {
     logging::start(settings.log_format);
     lower_priority(settings.engine.nice)?;
+    // A confined worker can't read the limits of its control group.
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
     if let Some(bytes) = settings.memory_limit() {
         limit_memory(bytes).map_err(CliError::Failure)?;
     }
@@ -59,7 +61,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     let ended = runtime.block_on(async {
         let stop = CancellationToken::new();
         tokio::spawn(listen(settings.supervised, stop.clone()));
-        match work(settings, (network, model), stop).await {
+        match work(settings, (network, model, cores), stop).await {
             Err(WorkEnd::Worker(error @ WorkerError::Unfinished)) => {
                 tracing::info!("{error}");
                 Ok(())
@@ -102,7 +104,7 @@ enum WorkEnd {
 
 async fn work(
     settings: &WorkerArguments,
-    (network, model): (NetworkSource, ModelCommand),
+    (network, model, cores): (NetworkSource, ModelCommand, usize),
     stop: CancellationToken,
 ) -> Result<(), WorkEnd> {
     let id = settings.id.unwrap_or_else(WorkerId::new);
@@ -111,7 +113,7 @@ async fn work(
     if settings.remote.nats.is_wanted() {
         let remote = remote_settings(settings);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
-        let ended = Worker::new(remote.clone(), network, model, stall, stop).run().await;
+        let ended = Worker::new(remote.clone(), network, model, cores, stall, stop).run().await;
         if let Some(refusal) = remote.refusal() {
             return Err(refusal.into());
         }
@@ -121,7 +123,7 @@ async fn work(
     let store = Store::open(settings.data_folder().unwrap_or(Path::new("")), Purpose::Use).await?;
     let local =
         Local::new(store.clone(), id, settings.takes.into(), settings.engine.device.clone());
-    let ended = Worker::new(local, network, model, stall, stop).run().await;
+    let ended = Worker::new(local, network, model, cores, stall, stop).run().await;
     store.close().await;
     Ok(ended?)
 }

@@ -4,12 +4,19 @@
 
 use std::path::PathBuf;
 
-use ndarray::{Array3, ArrayView3, s};
+use ndarray::{Array3, ArrayView3, Axis, s};
+use optics::{iid_masks, measure};
 use rand::{RngExt, SeedableRng};
+use reconstruction::cores::Cores;
 use reconstruction::priors::network::ClipDenoiser;
 use reconstruction::priors::onnx::{Device, Runtime};
 use reconstruction::priors::{CHANNELS, Denoiser, Network, Networks};
+use reconstruction::schedule::Schedule;
+use reconstruction::sequence::SequencePlan;
+use reconstruction::tile::TilePlan;
+use sci_recon_engine::job::Algorithm;
 use sci_recon_engine::pipeline::networks::{self, NetworkSource, WarmNetworks};
+use sci_recon_engine::pipeline::sequence::{SequenceInput, Solver, solve};
 
 /// Path of libonnxruntime, or none after a message. With `CI=true` in the environment, the test fails instead.
 fn library() -> Option<PathBuf> {
@@ -24,9 +31,13 @@ fn library() -> Option<PathBuf> {
 }
 
 fn load(which: Network) -> Option<ClipDenoiser> {
-    let runtime = Runtime::open(&library()?, Device::Cpu).unwrap();
-    let files: Vec<_> = networks::carried(which).files.iter().map(|(_, file)| *file).collect();
-    Some(ClipDenoiser::load(&runtime, which, &files).unwrap())
+    load_for(which, &Cores::default())
+}
+
+fn load_for(which: Network, cores: &Cores) -> Option<ClipDenoiser> {
+    let runtime = Runtime::open(&library()?, Device::Cpu).unwrap().with_cores(cores.clone());
+    let files = networks::carried(which).files.iter().map(|(_, file)| (*file).into());
+    Some(ClipDenoiser::load(&runtime, which, files).unwrap())
 }
 
 fn noisy(frames: usize, height: usize, width: usize) -> (Array3<f32>, Array3<f32>) {
@@ -64,6 +75,61 @@ fn frames_do_not_depend_on_the_batches_of_the_clip() {
     let mut short = video.slice(s![2..7, .., ..]).to_owned();
     network.denoise(&mut short, 0.1).unwrap();
     assert_eq!(long.slice(s![4, .., ..]), short.slice(s![2, .., ..]));
+}
+
+#[test]
+fn networks_give_the_same_bits_on_any_number_of_cores() {
+    for which in Network::ALL {
+        let cores = Cores::default();
+        let Some(mut network) = load_for(which, &cores) else { return };
+        let (_, video) = noisy(4, 90, 110);
+        let mut denoised = |count| {
+            cores.set(count);
+            let mut video = video.clone();
+            network.denoise(&mut video, 0.1).unwrap();
+            video
+        };
+        let alone = denoised(1);
+        for count in [2, 3, 8, 1] {
+            assert_eq!(denoised(count), alone, "{which:?} on {count} cores");
+        }
+    }
+}
+
+/// One tile with its pilot, by total variation, by the nonlocal prior, and by networks too.
+#[test]
+fn a_tile_has_the_same_bits_on_any_number_of_threads() {
+    let (height, width) = (72, 80);
+    let masks = iid_masks(5, height, width, 3).unwrap();
+    let (frames, _) = noisy(5, height, width);
+    let y = measure(masks.view(), frames.view()).unwrap().insert_axis(Axis(0));
+    let (plan, runs) = (TilePlan::new(height, width, 96, 0).unwrap(), SequencePlan::separate(0..1));
+    for algorithm in [Algorithm::GapTv, Algorithm::PnpNonlocal, Algorithm::PnpTvFastdvdnet] {
+        let mut schedule: Schedule = algorithm.default_schedule();
+        for stage in &mut schedule.stages {
+            stage.iterations = stage.iterations.min(9);
+        }
+        let library = if schedule.needs_network() { library() } else { None };
+        if schedule.needs_network() && library.is_none() {
+            return;
+        }
+        let network = NetworkSource::new(library, Device::Cpu);
+        let solved = |threads| {
+            let solver = Solver::Schedule(&schedule);
+            let (masks, measurement) = (masks.view(), y.view());
+            let (plan, runs, mosaic) = (&plan, &runs, None);
+            let white = 1.0;
+            let input =
+                SequenceInput { masks, measurement, first: 0, white, solver, plan, runs, mosaic };
+            let mut solved = solve(&input, &network, threads, &|_, _| ()).unwrap();
+            let tile = solved.runs.remove(0).remove(0);
+            (tile.frames, tile.residual, tile.features, solved.pilot)
+        };
+        let (alone, shared) = (solved(1), solved(3));
+        assert_eq!(shared.0, alone.0, "{algorithm:?}");
+        assert_eq!((shared.1, shared.2), (alone.1, alone.2), "{algorithm:?}");
+        assert_eq!(shared.3, alone.3, "{algorithm:?}");
+    }
 }
 
 #[test]

@@ -10,6 +10,7 @@
 mod admm;
 pub mod assessment;
 mod bounds;
+pub mod cores;
 pub mod crop;
 mod defaults;
 pub mod error;

@@ -8,6 +8,8 @@ use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 
+use super::cores::Cores;
+
 /// Side of the cells in pixels. Motion by much more than this from frame to frame is estimated wrongly.
 const CELL: usize = 8;
 /// Side of the windows in cells.
@@ -109,7 +111,7 @@ impl Motion {
     /// Estimates the motion of frames \[K,H,W\]. A cell takes the motion of the [`REACH`] cells around it, the global
     /// motion or none: the one with the smallest frame difference near the cell. A wrong estimate
     /// (periodic texture, more than a cell per frame) therefore gives no motion.
-    pub(super) fn of(frames: ArrayView3<'_, f32>) -> Self {
+    pub(super) fn of(frames: ArrayView3<'_, f32>, cores: &Cores) -> Self {
         let coarse = averaged(frames);
         let (count, rows, columns) = coarse.dim();
         if count < 2 || rows < 3 || columns < 3 {
@@ -126,7 +128,7 @@ impl Motion {
             let start = at.saturating_sub(reach).min(length - 3);
             start..(at + reach + 1).clamp(start + 3, length)
         };
-        let of_cells = Array2::from_shape_fn((rows, columns), |(row, column)| {
+        let motion_at = |row: usize, column: usize| {
             let window = s![.., around(row, REACH, rows), around(column, REACH, columns)];
             let pixels = |cells: Range<usize>| cells.start * CELL..cells.end * CELL;
             let area = (pixels(around(row, 1, rows)), pixels(around(column, 1, columns)));
@@ -139,8 +141,12 @@ impl Motion {
                 }
             }
             best
+        };
+        let mut motions = Array2::default((rows, columns));
+        cores.share(motions.outer_iter_mut().enumerate(), |(row, mut cells)| {
+            cells.indexed_iter_mut().for_each(|(column, cell)| *cell = motion_at(row, column));
         });
-        Self { of_cells }
+        Self { of_cells: motions }
     }
 
     /// The motion at this pixel.
@@ -210,7 +216,7 @@ fn steps(window: ArrayView3<'_, f32>) -> Steps {
 
 #[cfg(test)]
 mod tests {
-    use super::{Motion, fastest};
+    use super::{Cores, Motion, fastest};
     use ndarray::{Array3, s};
 
     /// Coarse and fine texture that moves by `rows` and `columns` pixels per frame.
@@ -247,7 +253,7 @@ mod tests {
     fn each_part_has_its_motion() {
         let mut frames = moving(0.0, 0.0);
         frames.slice_mut(s![.., .., 150..]).assign(&moving(-2.0, 4.0).slice(s![.., .., 150..]));
-        let motion = Motion::of(frames.view());
+        let motion = Motion::of(frames.view(), &Cores::default());
         assert_eq!((motion.at(80, 60), motion.at(0, 0)), ((0.0, 0.0), (0.0, 0.0)));
         for at in [(80, 230), (159, 299)] {
             let (down, right) = motion.at(at.0, at.1);
@@ -258,7 +264,7 @@ mod tests {
         }
         // A single frame, and frames too small for cells, have no estimate.
         for frames in [frames.slice(s![..1, .., ..]), frames.slice(s![.., ..20, ..])] {
-            assert_eq!(Motion::of(frames).at(10, 200), (0.0, 0.0));
+            assert_eq!(Motion::of(frames, &Cores::default()).at(10, 200), (0.0, 0.0));
         }
     }
 
@@ -269,6 +275,6 @@ mod tests {
             0.5 + 0.2 * fine.sin() * (j as f32 * 1.1).sin() + 0.05 * coarse.sin()
         });
         assert!((fastest(frames.view(), 1.0) - 5.0).abs() < 1.0);
-        assert_eq!(Motion::of(frames.view()).at(48, 64), (0.0, 0.0));
+        assert_eq!(Motion::of(frames.view(), &Cores::default()).at(48, 64), (0.0, 0.0));
     }
 }

@@ -378,6 +378,34 @@ async fn no_task_goes_to_two_workers_at_once() {
 }
 
 #[tokio::test]
+async fn workers_are_busy_as_far_as_there_are_tasks_for_them() {
+    let lab = Lab::new().await;
+    let (here, elsewhere) = (
+        WorkerPlace::default(),
+        WorkerPlace { host: Some("node".into()), ..WorkerPlace::default() },
+    );
+    for (place, claimant) in
+        [(&here, Claimant::Local), (&here, Claimant::Light), (&elsewhere, Claimant::Pool("pool"))]
+    {
+        lab.store.worker_started(WorkerId::new(), 2, place, claimant).await.unwrap();
+    }
+    let busy = async || lab.store.busy_workers(LEASE).await.unwrap();
+    assert_eq!(busy().await, 0);
+    lab.submit(0).await;
+    let mut beside_tile = Vec::new();
+    while let Some(task) = lab.claim().await {
+        if matches!(task.kind, TaskKind::Tile { .. }) {
+            beside_tile.push(busy().await);
+        }
+        lab.work(&task).await;
+    }
+    let last = beside_tile.pop();
+    assert_eq!(last, Some(1), "the last tile is computed alone");
+    assert!(beside_tile.len() > 1 && beside_tile.iter().all(|busy| *busy == 2), "{beside_tile:?}");
+    assert_eq!(busy().await, 0);
+}
+
+#[tokio::test]
 async fn a_silent_worker_loses_its_task_and_later_reports_are_refused() {
     let lab = Lab::new().await;
     let job = lab.submit(0).await;

@@ -232,6 +232,10 @@ impl Transport for Local {
         Ok(Some(Claim { lease, span, cost, input }))
     }
 
+    async fn busy_workers(&self) -> Result<Option<usize>, TransportError> {
+        Ok(Some(self.store.busy_workers(LEASE).await?))
+    }
+
     async fn heartbeat(
         &self,
         lease: &Lease,

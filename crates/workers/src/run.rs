@@ -21,6 +21,7 @@ use engine::job::without_paths;
 use engine::pipeline::networks::WarmNetworks;
 use engine::pipeline::progress::Monitor;
 use engine::pipeline::{NetworkSource, PipelineError};
+use reconstruction::cores::Cores;
 use store::{Heartbeat, Lease};
 
 /// Time between heartbeats, which is the longest time until the worker learns of a cancellation.
@@ -64,6 +65,9 @@ pub struct Worker<T> {
     engines: Option<Engines>,
     source: NetworkSource,
     model: ModelCommand,
+    machine_cores: usize,
+    /// This worker's share of them.
+    cores: Cores,
     /// See [`Worker::new`].
     stall: Duration,
     stop: CancellationToken,
@@ -82,16 +86,18 @@ enum StopReason {
 
 impl<T: Transport> Worker<T> {
     /// A worker that runs until `stop` is cancelled, and then returns its task. The program's networks come from
-    /// `source`; `model` runs those of users. A task counts as stalled after `stall` plus four times its planned
+    /// `source`; `model` runs those of users. All workers of this machine share its `cores`. A task counts as stalled after `stall` plus four times its planned
     /// time without progress.
     pub fn new(
         transport: T,
         source: NetworkSource,
         model: ModelCommand,
+        cores: usize,
         stall: Duration,
         stop: CancellationToken,
     ) -> Self {
-        Self { transport, engines: None, source, model, stall, stop }
+        let (machine_cores, cores) = (cores, Cores::default());
+        Self { transport, engines: None, source, model, machine_cores, cores, stall, stop }
     }
 
     /// Works until `stop` is cancelled.
@@ -137,6 +143,7 @@ impl<T: Transport> Worker<T> {
     async fn work(&mut self, claim: Claim) -> Result<(), WorkerError> {
         let Claim { lease, span, cost, input } = claim;
         let monitor = Arc::new(Monitor::default());
+        self.share_cores().await;
         let patience = self.stall + Duration::from_secs_f64(SLOWNESS * cost);
         let computing = self.start(input, &monitor, span.clone());
         let watched = async {
@@ -215,7 +222,7 @@ impl<T: Transport> Worker<T> {
         span: tracing::Span,
     ) -> JoinHandle<Computed> {
         let mut engines = self.engines.take().unwrap_or_else(|| Engines {
-            networks: WarmNetworks::new(self.source.clone()),
+            networks: WarmNetworks::new(self.source.clone()).with_cores(self.cores.clone()),
             models: ModelProcesses::new(self.model.clone()),
         });
         let (transport, monitor) = (self.transport.clone(), monitor.clone());
@@ -261,15 +268,26 @@ impl<T: Transport> Worker<T> {
                 () = self.stop.cancelled(), if reason.is_none() => reason = Some(StopReason::Shutdown),
                 () = &mut grace_over => return Err(WorkerError::Unfinished),
                 answer = &mut called_off, if reason.is_none() => reason = stop_reason(answer),
-                _ = tick.tick() => match self.beat(lease, monitor).await {
-                    Ok(answer) => reason = reason.or(stop_reason(answer)),
-                    // If this persists, the lease expires, and the store reports it lost.
-                    Err(error) => tracing::error!(%error, "a heartbeat is not recorded"),
-                },
+                _ = tick.tick() => {
+                    match self.beat(lease, monitor).await {
+                        Ok(answer) => reason = reason.or(stop_reason(answer)),
+                        // If this persists, the lease expires, and the store reports it lost.
+                        Err(error) => tracing::error!(%error, "a heartbeat is not recorded"),
+                    }
+                    self.share_cores().await;
+                }
             }
             if reason.is_some() {
                 monitor.stop();
             }
+        }
+    }
+
+    /// Divides the cores of this machine among the workers that compute. The task follows at its next iteration.
+    async fn share_cores(&self) {
+        match self.transport.busy_workers().await {
+            Ok(busy) => self.cores.set(busy.map_or(1, |busy| self.machine_cores / busy.max(1))),
+            Err(error) => tracing::warn!(%error, "the number of busy workers is unknown"),
         }
     }
 

@@ -55,6 +55,11 @@ pub trait Transport: Clone + Send + 'static {
         tokio::time::sleep(time).await;
     }
 
+    /// Number of workers that share the cores of this machine now; none if that is unknown. The worker then uses one core.
+    async fn busy_workers(&self) -> Result<Option<usize>, TransportError> {
+        Ok(None)
+    }
+
     /// Renews a lease, and records the progress and the solver's history (JSON). The answer says whether to continue.
     async fn heartbeat(
         &self,

@@ -12,6 +12,7 @@ use sha2::Digest;
 
 use crate::job::{JobSpec, Label, Schedule, Sha256};
 use reconstruction::ReconError;
+use reconstruction::cores::Cores;
 use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
 use reconstruction::priors::onnx::{Device, EndToEndNetwork, Runtime};
 use reconstruction::priors::{Denoiser, Encoder, Network, Networks};
@@ -316,13 +317,13 @@ impl NetworkSource {
     fn agreement(&self) -> Result<f32, String> {
         let text = |error: &dyn std::fmt::Display| error.to_string();
         let path = self.path().map_err(|error| text(&error))?;
-        let files = carried(Network::FfdNet).files.iter().map(|(_, content)| *content);
-        let files: Vec<&[u8]> = files.collect();
+        let files = carried(Network::FfdNet).files;
         let pass = |device| -> Result<Array3<f32>, ReconError> {
             let runtime = Runtime::open(&path, device)?;
             let mut frames =
                 Array3::from_shape_fn((1, 16, 16), |(_, i, j)| (i * 16 + j) as f32 / 255.0);
-            ClipDenoiser::load(&runtime, Network::FfdNet, &files)?.denoise(&mut frames, 0.1)?;
+            let files = files.iter().map(|(_, content)| Cow::Borrowed(*content));
+            ClipDenoiser::load(&runtime, Network::FfdNet, files)?.denoise(&mut frames, 0.1)?;
             Ok(frames)
         };
         let on_device = pass(self.device).map_err(|error| text(&error))?;
@@ -347,15 +348,17 @@ impl NetworkSource {
         Ok(self.version.get_or_init(read).clone())
     }
 
-    /// Loads a network with separate sessions for one thread.
-    fn load(&self, network: Network) -> Result<ClipDenoiser, NetworkError> {
+    /// Loads a network with separate sessions for these cores.
+    fn load(&self, network: Network, cores: &Cores) -> Result<ClipDenoiser, NetworkError> {
         let runtime = Runtime::open(&self.path()?, self.device_for(network))?;
-        Ok(ClipDenoiser::load(&runtime, network, &self.contents(network)?)?)
+        let runtime = runtime.with_cores(cores.clone());
+        Ok(ClipDenoiser::load(&runtime, network, self.contents(network)?)?)
     }
 
-    /// Loads the encoder with a separate session for one thread.
-    fn encoder(&self) -> Result<ClipEncoder, NetworkError> {
-        Ok(ClipEncoder::load(&self.runtime()?, FASTDVDNET_GRAY_ENCODER)?)
+    /// Loads the encoder with a separate session for these cores.
+    fn encoder(&self, cores: &Cores) -> Result<ClipEncoder, NetworkError> {
+        let runtime = self.runtime()?.with_cores(cores.clone());
+        Ok(ClipEncoder::load(&runtime, FASTDVDNET_GRAY_ENCODER)?)
     }
 
     /// Loads an end-to-end network from an ONNX file, with a separate session for one thread.
@@ -403,9 +406,10 @@ fn find_near(executable: &Path) -> Option<PathBuf> {
     LIBRARY_FOLDERS.iter().find_map(|place| existing(&folder.join(place).join(LIBRARY)))
 }
 
-/// The networks of one thread. Each one is loaded on first use and kept.
+/// The networks and cores of one reconstruction after another. Each network is loaded on first use and kept.
 pub struct WarmNetworks {
     source: NetworkSource,
+    cores: Cores,
     loaded: Vec<(Network, ClipDenoiser)>,
     encoder: Option<ClipEncoder>,
     /// The most recently used end-to-end network.
@@ -413,9 +417,16 @@ pub struct WarmNetworks {
 }
 
 impl WarmNetworks {
-    /// An empty cache of networks from `source`.
+    /// An empty cache of networks from `source`, and one core.
     pub fn new(source: NetworkSource) -> Self {
-        Self { source, loaded: Vec::new(), encoder: None, end_to_end: None }
+        let cores = Cores::default();
+        Self { source, cores, loaded: Vec::new(), encoder: None, end_to_end: None }
+    }
+
+    /// Uses these cores.
+    #[must_use]
+    pub fn with_cores(self, cores: Cores) -> Self {
+        Self { cores, ..self }
     }
 
     /// The end-to-end network in this file. It replaces the one that was used before.
@@ -435,11 +446,15 @@ impl WarmNetworks {
 }
 
 impl Networks for WarmNetworks {
+    fn cores(&self) -> Cores {
+        self.cores.clone()
+    }
+
     fn network(&mut self, network: Network) -> Result<&mut dyn Denoiser, ReconError> {
         let index = match self.loaded.iter().position(|(key, _)| *key == network) {
             Some(index) => index,
             None => {
-                let denoiser = self.source.load(network);
+                let denoiser = self.source.load(network, &self.cores);
                 let denoiser = denoiser.map_err(|error| ReconError::Runtime(error.to_string()))?;
                 self.loaded.push((network, denoiser));
                 self.loaded.len() - 1
@@ -452,7 +467,7 @@ impl Networks for WarmNetworks {
         let encoder = match self.encoder.take() {
             Some(encoder) => encoder,
             None => {
-                let loaded = self.source.encoder();
+                let loaded = self.source.encoder(&self.cores);
                 loaded.map_err(|error| ReconError::Runtime(error.to_string()))?
             }
         };
@@ -496,6 +511,7 @@ mod tests {
         find_near, version_in,
     };
     use crate::job::{Algorithm, Sha256};
+    use reconstruction::cores::Cores;
     use reconstruction::priors::Network;
     use reconstruction::priors::onnx::Device;
 
@@ -524,7 +540,7 @@ mod tests {
     #[test]
     fn the_error_names_the_missing_library() {
         let source = NetworkSource::new(Some("/nowhere/libonnxruntime.so".into()), Device::Cpu);
-        let error = source.load(Network::FfdNet).err().unwrap().to_string();
+        let error = source.load(Network::FfdNet, &Cores::default()).err().unwrap().to_string();
         assert!(error.contains("/nowhere/libonnxruntime.so"), "{error}");
         assert!(error.contains("--onnxruntime"), "{error}");
     }

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::thread;
 
 use ndarray::{Array2, ArrayView3, Axis, s};
@@ -15,6 +16,7 @@ use super::progress::ShareDone;
 use super::records::{PilotRecord, TileRecord};
 use super::tile::{TileInput, reconstruct_tile, run_network};
 use optics::Mosaic;
+use reconstruction::cores::Cores;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::{Piece, RunShare, SequencePlan};
 use reconstruction::solver::{Control, Observer, Outcome, Progress};
@@ -119,8 +121,9 @@ impl Solved {
 /// called from all threads.
 pub type TileProgress<'a> = &'a (dyn Fn(usize, f64) + Sync);
 
-/// Solves all tiles of all runs on up to `threads` threads, with one denoiser per thread. The pilot first decides an
-/// adaptive schedule and the cuts between snapshots. The result does not depend on the number of threads.
+/// Solves all tiles of all runs on `threads` threads, with one denoiser per tile at work. The tiles at work share threads for
+/// which there is no other tile. The pilot first decides an adaptive schedule and the cuts between snapshots. The result does
+/// not depend on the number of threads.
 /// Errors: the first failure of any tile; the others stop at their next iteration.
 pub fn solve(
     input: &SequenceInput<'_>,
@@ -133,7 +136,7 @@ pub fn solve(
         let light = input.masks.sum_axis(Axis(0));
         let first = input.measurement.index_axis(Axis(0), 0);
         let crop = pilot::choose_crop(light.view(), first, input.mosaic);
-        let mut networks = WarmNetworks::new(network.clone());
+        let mut networks = WarmNetworks::new(network.clone()).with_cores(Cores::new(threads));
         let window = input.window(input.snapshots(), crop.clone(), Vec::new());
         let task = pilot::Pilot { first: input.first, crop: &crop, schedule, runs: input.runs };
         pilot = pilot::decide(window, &task, &mut networks, &mut ())?;
@@ -170,8 +173,10 @@ fn run_tiles(
         let tile = input.plan.tile(index % input.plan.len())?;
         (run < input.runs.runs().len()).then_some((index, run, tile))
     };
+    let count = threads.clamp(1, input.plan.len() * input.runs.runs().len());
+    let cores = Cores::new(threads / count);
     let tiles = || -> Result<Vec<(usize, Outcome)>> {
-        let mut networks = WarmNetworks::new(network.clone());
+        let mut networks = WarmNetworks::new(network.clone()).with_cores(cores.clone());
         let mut done = Vec::new();
         while let Some((index, run, tile)) = claim() {
             let snapshots = input.runs.runs()[run].clone();
@@ -197,9 +202,15 @@ fn run_tiles(
         }
         Ok(done)
     };
-    let thread = || tiles().inspect_err(|_| stop.store(true, Ordering::Relaxed));
+    let at_work = Mutex::new(count);
+    let thread = || {
+        let done = tiles().inspect_err(|_| stop.store(true, Ordering::Relaxed));
+        let mut at_work = at_work.lock().unwrap_or_else(PoisonError::into_inner);
+        *at_work -= 1;
+        cores.set(threads / (*at_work).max(1));
+        done
+    };
     let outcomes: Vec<_> = thread::scope(|scope| {
-        let count = threads.clamp(1, input.plan.len() * input.runs.runs().len());
         let handles: Vec<_> = (0..count).map(|_| scope.spawn(thread)).collect();
         handles.into_iter().map(|h| h.join().unwrap_or(Err(PipelineError::Thread))).collect()
     });

@@ -16,6 +16,7 @@ use std::fmt::Debug;
 use ndarray::{Array3, Array4, ArrayView3};
 use schemars::Schema;
 
+use super::cores::Cores;
 use super::error::{ReconError, Result};
 #[cfg(feature = "gpu")]
 use super::gpu::adapter::Gpu;
@@ -169,8 +170,13 @@ pub const BLOCK: usize = 16;
 /// Number of features of a block.
 pub const CHANNELS: usize = 128;
 
-/// A source of networks for the solver.
+/// A source of networks for the solver, and the cores that it may use.
 pub trait Networks {
+    /// The cores for priors; one, unless stated otherwise.
+    fn cores(&self) -> Cores {
+        Cores::default()
+    }
+
     /// The network, loaded at its first use.
     ///
     /// # Errors

@@ -1,6 +1,8 @@
 //! Networks as priors: FFDNet, frame by frame (Zhang, Zuo and Zhang, IEEE TIP 2018), and FastDVDNet over whole
 //! clips (Tassano et al., CVPR 2020), with floating point or 8 bits.
 
+use std::borrow::Cow;
+
 use ndarray::{Array3, Array4, ArrayView2, ArrayView3, ArrayView4, ArrayViewMut2, Axis};
 
 use schemars::JsonSchema;
@@ -114,7 +116,11 @@ pub struct ClipDenoiser {
 
 impl ClipDenoiser {
     /// Loads a network from its ONNX files, a block each (see [`ClipNetwork::load`] for their inputs and outputs).
-    pub fn load(runtime: &Runtime, which: Network, files: &[impl AsRef<[u8]>]) -> Result<Self> {
+    pub fn load(
+        runtime: &Runtime,
+        which: Network,
+        files: impl IntoIterator<Item = Cow<'static, [u8]>>,
+    ) -> Result<Self> {
         let (names, reach, multiple): (&[_], _, _) = match which {
             Network::FfdNet => (&["FFDNet"], 0, 2),
             Network::FastDvdNet | Network::FastDvdNetInt8 => {
@@ -122,7 +128,7 @@ impl ClipDenoiser {
             }
         };
         let files = names.iter().zip(files);
-        let blocks = files.map(|(name, file)| ClipNetwork::load(runtime, name, file.as_ref()));
+        let blocks = files.map(|(name, file)| ClipNetwork::load(runtime, name, file));
         let blocks = blocks.collect::<Result<_, _>>()?;
         Ok(Self { blocks, reach, multiple, input: Vec::new(), output: Vec::new() })
     }
@@ -161,8 +167,8 @@ const ENCODER_SIGMA: f32 = 10.0 / 255.0;
 
 impl ClipEncoder {
     /// Loads it from its ONNX file (see [`ClipNetwork::load`] for its inputs and outputs).
-    pub fn load(runtime: &Runtime, file: &[u8]) -> Result<Self> {
-        let network = ClipNetwork::load(runtime, "FastDVDNet encoder", file)?;
+    pub fn load(runtime: &Runtime, file: &'static [u8]) -> Result<Self> {
+        let network = ClipNetwork::load(runtime, "FastDVDNet encoder", file.into())?;
         Ok(Self { network, input: Vec::new(), output: Vec::new() })
     }
 }

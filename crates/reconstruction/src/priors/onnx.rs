@@ -1,5 +1,6 @@
 //! ONNX Runtime. No other file uses `ort`.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::Path;
 use std::sync::OnceLock;
@@ -11,6 +12,7 @@ use ort::session::Session;
 use ort::session::builder::GraphOptimizationLevel;
 use ort::value::{Outlet, Tensor, TensorElementType, TensorRef, ValueType};
 
+use crate::cores::Cores;
 use crate::error::{ReconError, Result, shape_text};
 use crate::learned::{
     FRAMES, Interface, MASKS, MEASUREMENT, SnapshotNetwork, TensorInfo, all_finite,
@@ -19,7 +21,7 @@ use crate::learned::{
 /// Where a network runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Device {
-    /// The processor, one thread a session.
+    /// The processor.
     #[default]
     Cpu,
     /// The first adapter of the WebGPU execution provider: a GPU of any vendor.
@@ -97,11 +99,12 @@ impl fmt::Display for Device {
     }
 }
 
-/// The loaded libonnxruntime, and the device of its sessions.
+/// The loaded libonnxruntime, and the device and cores of its sessions.
 #[derive(Debug, Clone)]
 pub struct Runtime {
     environment: Environment,
     device: Device,
+    cores: Cores,
 }
 
 /// Folder of external weights of a network. Our networks have none. Without this setting, an uploaded network could
@@ -113,7 +116,7 @@ const NOWHERE: &str = "/dev/null/nowhere";
 static ENVIRONMENT: OnceLock<Result<Environment, String>> = OnceLock::new();
 
 impl Runtime {
-    /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`.
+    /// Loads `library` (a libonnxruntime of 1.24 or later) and prepares for `device`, with one core.
     ///
     /// # Errors
     /// The library is missing or too old. If the device is unavailable, loading a network fails; there is no silent
@@ -131,9 +134,17 @@ impl Runtime {
             builder.build().map_err(|error| format!("ONNX Runtime does not start: {error}"))
         });
         match loaded {
-            Ok(environment) => Ok(Self { environment: environment.clone(), device }),
+            Ok(environment) => {
+                Ok(Self { environment: environment.clone(), device, cores: Cores::default() })
+            }
             Err(message) => Err(ReconError::Runtime(message.clone())),
         }
+    }
+
+    /// Lets clip networks use these cores.
+    #[must_use]
+    pub fn with_cores(self, cores: Cores) -> Self {
+        Self { cores, ..self }
     }
 
     /// The device that sessions run on.
@@ -146,7 +157,7 @@ impl Runtime {
         ort::info()
     }
 
-    fn session(&self, name: &str, model: &[u8]) -> Result<Session> {
+    fn session(&self, name: &str, model: &[u8], threads: usize) -> Result<Session> {
         let failed = |error: String| {
             ReconError::Runtime(format!(
                 "the network {name} can't be loaded on {}: {error}",
@@ -159,7 +170,10 @@ impl Runtime {
                 .map_err(|error| error.to_string())?
                 .with_optimization_level(GraphOptimizationLevel::All)
                 .map_err(text)?
-                .with_intra_threads(1)
+                .with_intra_threads(threads)
+                .map_err(text)?
+                // Threads that wait for work leave their core to others.
+                .with_intra_op_spinning(false)
                 .map_err(text)?
                 .with_inter_threads(1)
                 .map_err(text)?
@@ -181,18 +195,22 @@ impl Runtime {
     }
 }
 
-/// A network that maps a clip and a noise level to a clip.
+/// A network that maps a clip and a noise level to a clip. On a CPU it runs on the cores of its [`Runtime`].
 pub struct ClipNetwork {
     name: String,
-    device: Device,
-    session: Session,
+    model: Cow<'static, [u8]>,
+    runtime: Runtime,
+    /// The session and its number of threads; none after a failure to load it.
+    session: Option<(usize, Session)>,
 }
 
 impl ClipNetwork {
     /// Loads a network with inputs `frames` \[n+2,1,H,W\] and `sigma` (a number) and one
     /// output \[n,..\].
-    pub fn load(runtime: &Runtime, name: &str, model: &[u8]) -> Result<Self> {
-        let session = runtime.session(name, model)?;
+    pub fn load(runtime: &Runtime, name: &str, model: Cow<'static, [u8]>) -> Result<Self> {
+        let runtime = runtime.clone();
+        let mut network = Self { name: name.to_string(), model, runtime, session: None };
+        let session = network.session()?;
         let inputs: Vec<&str> = session.inputs().iter().map(|input| input.name()).collect();
         if inputs != ["frames", "sigma"] || session.outputs().len() != 1 {
             return Err(ReconError::Runtime(format!(
@@ -201,7 +219,21 @@ impl ClipNetwork {
                 session.outputs().len()
             )));
         }
-        Ok(Self { name: name.to_string(), device: runtime.device, session })
+        Ok(network)
+    }
+
+    /// The session for the present number of cores. A session has a fixed number of threads, so it is replaced when that
+    /// number changes.
+    fn session(&mut self) -> Result<&mut Session> {
+        let Self { name, model, runtime, session } = self;
+        let threads = if runtime.device == Device::Cpu { runtime.cores.count() } else { 1 };
+        // The old session is freed before the new one is loaded.
+        let kept = session.take().filter(|(count, _)| *count == threads);
+        let loaded = match kept {
+            Some(kept) => kept,
+            None => (threads, runtime.session(name, model, threads)?),
+        };
+        Ok(&mut session.insert(loaded).1)
     }
 
     /// Runs `frames` \[n+2,1,H,W\], in standard layout, and writes the output for the n middle ones.
@@ -211,11 +243,11 @@ impl ClipNetwork {
         sigma: f32,
         output: &mut [f32],
     ) -> Result<()> {
-        let Self { name, device, session } = self;
-        let failed = |error: ort::Error| device.failure(name, &error.to_string());
+        let (name, device) = (self.name.clone(), self.runtime.device);
+        let failed = |error: ort::Error| device.failure(&name, &error.to_string());
         let frames = TensorRef::from_array_view(frames).map_err(failed)?;
         let sigma = Tensor::from_array(ndarray::arr0(sigma)).map_err(failed)?;
-        let outputs = session.run(ort::inputs![frames, sigma]).map_err(failed)?;
+        let outputs = self.session()?.run(ort::inputs![frames, sigma]).map_err(failed)?;
         let (shape, values) = outputs[0].try_extract_tensor::<f32>().map_err(failed)?;
         if values.len() != output.len() {
             return Err(ReconError::Runtime(format!(
@@ -239,7 +271,7 @@ impl EndToEndNetwork {
     /// # Errors
     /// [`ReconError::Runtime`]: ONNX Runtime refuses the network.
     pub fn load(runtime: &Runtime, model: &[u8]) -> Result<Self> {
-        Ok(Self { session: runtime.session("of the file", model)? })
+        Ok(Self { session: runtime.session("of the file", model, 1)? })
     }
 
     /// Inputs and outputs of the network.

@@ -124,6 +124,19 @@ impl Store {
         sql_as!(live, [since(age)]).fetch_one(&self.readers).await
     }
 
+    /// Number of workers of this machine that compute now or in a moment: those that gave a sign of life within `age`, but
+    /// at most as many as there are running tasks and tiles that are ready. Short tasks do not count.
+    pub async fn busy_workers(&self, age: Duration) -> Result<usize> {
+        let live = "SELECT count(*) FROM workers WHERE seen_at >= ? AND light = 0 AND host IS NULL";
+        let live: i64 = sql_as!(live, [since(age)]).fetch_one(&self.readers).await?;
+        let tasks = "SELECT (SELECT count(*) FROM tasks
+                             WHERE state = 'running' AND light = 0 AND lease_until IS NOT NULL)
+                          + (SELECT count(*) FROM (SELECT 1 FROM tasks
+                                                   WHERE state = 'ready' AND kind = 'tile' LIMIT ?))";
+        let tasks: i64 = sql_as!(tasks, [live]).fetch_one(&self.readers).await?;
+        Ok(usize::try_from(live.min(tasks)).unwrap_or(usize::MAX))
+    }
+
     /// The last sign of life of any worker that takes tiles; none if there was none.
     pub async fn last_tile_worker(&self) -> Result<Option<Timestamp>> {
         let last = "SELECT max(seen_at) FROM (SELECT seen_at FROM workers WHERE tiles = 1

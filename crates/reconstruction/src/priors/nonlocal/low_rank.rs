@@ -13,12 +13,13 @@ use super::layout::{BATCH, PATCHES, PIXELS};
 const ROWS: usize = 4;
 const _: () = assert!(PIXELS.is_multiple_of(ROWS) && PATCHES.is_multiple_of(4));
 
-/// The patches of a batch of groups and the matrices of their filter. An element of a matrix is a vector with one
-/// number for each of several groups; a batch has several such matrices in sequence.
+/// Number of values of the patches `Y` of a batch of groups: \[PIXELS, PATCHES\].
+pub(super) const BATCH_VALUES: usize = PIXELS * PATCHES * BATCH;
+
+/// The matrices of the filter of a batch of groups. An element of a matrix is a vector with one number for each of several
+/// groups; a batch has several such matrices in sequence.
 #[derive(Debug)]
 pub(super) struct Filter {
-    /// `Y`: \[PIXELS, PATCHES\].
-    pub(super) patches: Vec<f32>,
     /// `G`: \[PIXELS, PIXELS\].
     gram: Vec<f32>,
     /// Lower triangle of the Cholesky factor, with the reciprocals of its diagonal: \[PIXELS, PIXELS\].
@@ -30,8 +31,7 @@ pub(super) struct Filter {
 impl Default for Filter {
     fn default() -> Self {
         let matrix = |columns: usize| vec![0.0; PIXELS * columns * BATCH];
-        let (patches, solved) = (matrix(PATCHES), matrix(PATCHES));
-        Self { patches, gram: matrix(PIXELS), factor: matrix(PIXELS), solved }
+        Self { gram: matrix(PIXELS), factor: matrix(PIXELS), solved: matrix(PATCHES) }
     }
 }
 
@@ -40,13 +40,13 @@ impl Default for Filter {
 
 /// Performs a step on each part of a batch, in tiles as wide as the registers of the machine allow.
 macro_rules! for_each_part {
-    ($simd:ident, $filter:ident, $part:ident => $step:expr) => {
+    ($simd:ident, $batch:expr, $part:ident => $step:expr) => {
         if S::F32_LANES == 16 {
-            for mut $part in parts::<S, 4>($simd, $filter) {
+            for mut $part in parts::<S, 4>($simd, $batch) {
                 $step
             }
         } else {
-            for mut $part in parts::<S, 2>($simd, $filter) {
+            for mut $part in parts::<S, 2>($simd, $batch) {
                 $step
             }
         }
@@ -55,28 +55,28 @@ macro_rules! for_each_part {
 
 /// `G = (Y - mean) (Y - mean)^T`.
 #[inline(always)]
-pub(super) fn multiply<S: Simd>(simd: S, filter: &mut Filter) {
-    for_each_part!(simd, filter, part => part.multiply());
+pub(super) fn multiply<S: Simd>(simd: S, patches: &mut [f32], filter: &mut Filter) {
+    for_each_part!(simd, (patches, filter), part => part.multiply());
 }
 
 /// The Cholesky factor of `G^2 + tau^2`.
 #[inline(always)]
-pub(super) fn factorize<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
-    for_each_part!(simd, filter, part => part.factorize(tau));
+pub(super) fn factorize<S: Simd>(simd: S, patches: &mut [f32], filter: &mut Filter, tau: f32) {
+    for_each_part!(simd, (patches, filter), part => part.factorize(tau));
 }
 
 /// Computes the filtered patches in place of `Y`.
 #[inline(always)]
-pub(super) fn solve<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
-    for_each_part!(simd, filter, part => part.solve(tau));
+pub(super) fn solve<S: Simd>(simd: S, patches: &mut [f32], filter: &mut Filter, tau: f32) {
+    for_each_part!(simd, (patches, filter), part => part.solve(tau));
 }
 
 #[inline(always)]
-fn parts<S: Simd, const C: usize>(
+fn parts<'a, S: Simd, const C: usize>(
     simd: S,
-    filter: &mut Filter,
-) -> impl Iterator<Item = Part<'_, S, C>> {
-    let Filter { patches, gram, factor, solved } = filter;
+    (patches, filter): (&'a mut [f32], &'a mut Filter),
+) -> impl Iterator<Item = Part<'a, S, C>> {
+    let Filter { gram, factor, solved } = filter;
     let patches = S::as_mut_simd_f32s(patches).0.chunks_exact_mut(PIXELS * PATCHES);
     let gram = S::as_mut_simd_f32s(gram).0.chunks_exact_mut(PIXELS * PIXELS);
     let factor = S::as_mut_simd_f32s(factor).0.chunks_exact_mut(PIXELS * PIXELS);
@@ -325,7 +325,7 @@ fn store<V: Copy, const C: usize>(
 #[cfg(test)]
 mod tests {
     use super::super::layout::place_of;
-    use super::{BATCH, Filter, PATCHES, PIXELS, factorize, multiply, solve};
+    use super::{BATCH, BATCH_VALUES, Filter, PATCHES, PIXELS, factorize, multiply, solve};
     use pulp::{Arch, Simd, WithSimd};
     use rand::{RngExt, SeedableRng};
 
@@ -342,21 +342,20 @@ mod tests {
 
         #[inline(always)]
         fn with_simd<S: Simd>(self, simd: S) -> Vec<Patches> {
-            let mut filter = Filter::default();
+            let (mut patches, mut filter) = (vec![0.0; BATCH_VALUES], Filter::default());
             let place =
                 |group, i: usize, patch| place_of::<S>(group, patch) + i * PATCHES * S::F32_LANES;
             for (index, group) in self.groups.iter().enumerate() {
                 for (i, row) in group.iter().enumerate() {
                     for (patch, &value) in row.iter().enumerate() {
-                        filter.patches[place(index, i, patch)] = value;
+                        patches[place(index, i, patch)] = value;
                     }
                 }
             }
-            multiply(simd, &mut filter);
-            factorize(simd, &mut filter, self.tau);
-            solve(simd, &mut filter, self.tau);
-            let row =
-                |group, i| std::array::from_fn(|patch| filter.patches[place(group, i, patch)]);
+            multiply(simd, &mut patches, &mut filter);
+            factorize(simd, &mut patches, &mut filter, self.tau);
+            solve(simd, &mut patches, &mut filter, self.tau);
+            let row = |group, i| std::array::from_fn(|patch| patches[place(group, i, patch)]);
             let group = |group| (0..PIXELS).map(|i| row(group, i)).collect();
             (0..self.groups.len()).map(group).collect()
         }

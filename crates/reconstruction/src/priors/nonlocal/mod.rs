@@ -18,10 +18,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Family, Networks, Prior, Size, Spec, WorkingSet, noise_levels};
+use crate::cores::{Cores, share_with};
 use crate::error::Result;
 use crate::motion::Motion;
 use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
-use low_rank::Filter;
+use low_rank::{BATCH_VALUES, Filter};
+use search::{Best, Line};
 use temporal_shrinkage::TemporalShrinkage;
 
 /// Parameters of the nonlocal low-rank prior.
@@ -101,8 +103,9 @@ impl Spec for NonlocalSpec {
         WorkingSet { per_voxel: 30, per_network_pixel: 0 }
     }
 
-    fn start<'n>(&self, size: Size, _: &'n mut dyn Networks) -> Result<Box<dyn Prior + 'n>> {
+    fn start<'n>(&self, size: Size, networks: &'n mut dyn Networks) -> Result<Box<dyn Prior + 'n>> {
         let mut nonlocal = Nonlocal::new(size);
+        nonlocal.cores = networks.cores();
         nonlocal.motion_compensation = self.motion_compensation;
         nonlocal.outlier_limit = self.outlier_limit.unwrap_or(f32::INFINITY);
         Ok(Box::new(NonlocalPrior { nonlocal, shrinkage: self.temporal_shrinkage }))
@@ -129,6 +132,12 @@ const STRENGTH: f32 = 4.0;
 /// a separate direction of its group, so the filter never removes it. Behind highly correlated masks, where the projection
 /// does not fix a single frame, such outliers grow.
 const OUTLIER_LIMIT: f32 = 4.0;
+/// Number of batches that several cores filter before their patches are accumulated: enough that the cores rarely wait for
+/// each other. The patches then take 6 MB.
+const BATCHES_AT_ONCE: usize = 64;
+/// Step between the patches by which the accumulation is divided among cores. It is prime, so that it meets all places of a
+/// group.
+const SAMPLE_STEP: usize = 61;
 
 /// The prior with its groups and working memory, for clips of one size.
 #[derive(Debug)]
@@ -149,7 +158,11 @@ pub struct Nonlocal {
     cover: Vec<f32>,
     /// Top left pixels of all patches, `PATCHES` for a group.
     groups: Vec<u32>,
-    filter: Filter,
+    /// The patches of the batches that are filtered together.
+    patches: Vec<f32>,
+    /// Working memory of each core.
+    filters: Vec<Filter>,
+    cores: Cores,
     /// The vector instructions of this machine.
     arch: Arch,
     /// True if search windows follow the motion.
@@ -173,7 +186,9 @@ impl Nonlocal {
             temporal_shrinkage: TemporalShrinkage::new((frames, height, width)),
             cover: vec![0.0; size],
             groups: Vec::new(),
-            filter: Filter::default(),
+            patches: Vec::new(),
+            filters: Vec::new(),
+            cores: Cores::default(),
             arch: Arch::new(),
             motion_compensation: true,
             outlier_limit: OUTLIER_LIMIT,
@@ -192,9 +207,10 @@ impl Nonlocal {
         }
         let row_length = row_length(self.width);
         let planes = self.noisy.chunks_exact_mut(self.height * row_length);
-        for (plane, frame) in planes.zip(frames.outer_iter()) {
-            limit_outliers(frame, self.outlier_limit * sigma, plane.chunks_exact_mut(row_length));
-        }
+        let margin = self.outlier_limit * sigma;
+        self.cores.share(planes.zip(frames.outer_iter()), |(plane, frame)| {
+            limit_outliers(frame, margin, plane.chunks_exact_mut(row_length));
+        });
         if shrinkage > 0.0 {
             self.temporal_shrinkage.shrink(&mut self.noisy, row_length, shrinkage * sigma);
         }
@@ -218,8 +234,91 @@ impl Nonlocal {
 
     /// Runs some parts of an iteration on the current clip, for benchmarks.
     pub fn work(&mut self, parts: &[Part], sigma: f32) {
-        self.arch.dispatch(Work { prior: self, parts, sigma });
+        if parts.contains(&Part::Search) {
+            self.search();
+        }
+        self.filter(parts, sigma);
     }
+
+    /// Finds the groups of all reference patches, and counts how many patches cover each pixel.
+    fn search(&mut self) {
+        let Self { guide, groups, cover, cores, arch, .. } = self;
+        let size = (self.frames, self.height, self.width);
+        let row_length = row_length(size.2);
+        let strides = (size.1 * row_length, row_length, 1);
+        let clip = ArrayView3::from_shape(size.strides(strides), guide.as_slice())
+            .expect("a clip with a margin");
+        let motion =
+            if self.motion_compensation { Motion::of(clip, cores) } else { Motion::none() };
+        let lines = search::lines(size, self.passes / REFRESH);
+        groups.resize(lines.iter().map(Line::len).sum::<usize>() * PATCHES, 0);
+        let mut rest = groups.as_mut_slice();
+        let parts = lines.iter().map(|line| {
+            let slots = rest.split_off_mut(..line.len() * PATCHES).unwrap_or_default();
+            (line, slots)
+        });
+        let clip = (guide.as_slice(), size);
+        let mut memories: Vec<Best> = (0..cores.count()).map(|_| Best::default()).collect();
+        share_with(&mut memories, parts, |best, (line, groups)| {
+            arch.dispatch(Search { clip, line, motion: &motion, best, groups });
+        });
+        search::count_cover(groups, cover, row_length);
+    }
+
+    /// Filters the groups, and accumulates their patches in the order of the groups, whatever the number of cores.
+    fn filter(&mut self, parts: &[Part], sigma: f32) {
+        let Self { noisy, sum, groups, patches, filters, cores, arch, .. } = self;
+        let row_length = row_length(self.width);
+        let tau = STRENGTH * PATCHES as f32 * sigma * sigma;
+        let count = cores.count();
+        // A single core accumulates the patches of a batch while they are in cache.
+        let at_once = if count > 1 { BATCHES_AT_ONCE } else { 1 };
+        filters.resize_with(count, Filter::default);
+        patches.resize(at_once * BATCH_VALUES, 0.0);
+        sum.fill(0.0);
+        for groups in groups.chunks(at_once * BATCH * PATCHES) {
+            let batches =
+                groups.chunks(BATCH * PATCHES).zip(patches.chunks_exact_mut(BATCH_VALUES));
+            share_with(filters, batches, |filter, (groups, patches)| {
+                let clip = noisy.as_slice();
+                arch.dispatch(Work { clip, row_length, groups, patches, filter, parts, tau });
+            });
+            if parts.contains(&Part::Scatter) {
+                let strips = strips(sum, row_length, groups, count);
+                share_with(&mut vec![(); count], strips.into_iter(), |(), strip| {
+                    arch.dispatch(Accumulate { patches, row_length, groups, strip });
+                });
+            }
+        }
+    }
+}
+
+/// Rows of a clip.
+struct Strip<'a> {
+    /// Index of the first value in the clip.
+    first: usize,
+    values: &'a mut [f32],
+}
+
+/// Divides a clip into `count` strips of whole rows that contain about as many of the patches each.
+fn strips<'a>(
+    mut clip: &'a mut [f32],
+    row_length: usize,
+    groups: &[u32],
+    count: usize,
+) -> Vec<Strip<'a>> {
+    let mut sample: Vec<u32> = groups.iter().step_by(SAMPLE_STEP).copied().collect();
+    sample.sort_unstable();
+    let mut strips = Vec::with_capacity(count);
+    let mut first = 0;
+    for part in 1..count {
+        let row = sample[part * sample.len() / count] as usize / row_length;
+        let (values, rest) = clip.split_at_mut(row * row_length - first);
+        strips.push(Strip { first, values });
+        (first, clip) = (row * row_length, rest);
+    }
+    strips.push(Strip { first, values: clip });
+    strips
 }
 
 /// Copies a frame \[H,W\], at least 2x2, into rows of at least its width, and clamps each pixel to the range of its eight
@@ -275,10 +374,33 @@ impl Part {
         [Self::Search, Self::Gather, Self::Gram, Self::Factor, Self::Solve, Self::Scatter];
 }
 
+/// The search of a line of references.
+struct Search<'a> {
+    clip: (&'a [f32], Size),
+    line: &'a Line,
+    motion: &'a Motion,
+    best: &'a mut Best,
+    groups: &'a mut [u32],
+}
+
+impl WithSimd for Search<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        search::search(simd, self.clip, self.line, self.motion, self.best, self.groups);
+    }
+}
+
+/// The filter of a batch of groups.
 struct Work<'a> {
-    prior: &'a mut Nonlocal,
+    clip: &'a [f32],
+    row_length: usize,
+    groups: &'a [u32],
+    patches: &'a mut [f32],
+    filter: &'a mut Filter,
     parts: &'a [Part],
-    sigma: f32,
+    tau: f32,
 }
 
 impl WithSimd for Work<'_> {
@@ -286,36 +408,36 @@ impl WithSimd for Work<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let (parts, sigma) = (self.parts, self.sigma);
-        if parts.contains(&Part::Search) {
-            {
-                let motion_compensation = self.prior.motion_compensation;
-                let Nonlocal { guide, groups, cover, frames, height, width, passes, .. } =
-                    &mut *self.prior;
-                let (size, searches) = ((*frames, *height, *width), *passes / REFRESH);
-                let row_length = row_length(size.2);
-                let strides = (size.1 * row_length, row_length, 1);
-                let clip = ArrayView3::from_shape(size.strides(strides), guide.as_slice())
-                    .expect("a clip with a margin");
-                let motion = if motion_compensation { Motion::of(clip) } else { Motion::none() };
-                search::search(simd, guide, size, searches, &motion, groups, cover);
+        let Self { clip, row_length, groups, patches, filter, parts, tau } = self;
+        for part in parts {
+            match part {
+                Part::Search | Part::Scatter => {}
+                Part::Gather => gather::<S>(clip, row_length, groups, patches),
+                Part::Gram => low_rank::multiply(simd, patches, filter),
+                Part::Factor => low_rank::factorize(simd, patches, filter, tau),
+                Part::Solve => low_rank::solve(simd, patches, filter, tau),
             }
         }
-        let Nonlocal { noisy, sum, groups, filter, width, .. } = self.prior;
-        let row_length = row_length(*width);
-        let tau = STRENGTH * PATCHES as f32 * sigma * sigma;
-        sum.fill(0.0);
-        for batch in groups.chunks(BATCH * PATCHES) {
-            for part in parts {
-                match part {
-                    Part::Search => {}
-                    Part::Gather => gather::<S>(noisy, row_length, batch, &mut filter.patches),
-                    Part::Gram => low_rank::multiply(simd, filter),
-                    Part::Factor => low_rank::factorize(simd, filter, tau),
-                    Part::Solve => low_rank::solve(simd, filter, tau),
-                    Part::Scatter => scatter::<S>(&filter.patches, row_length, batch, sum),
-                }
-            }
+    }
+}
+
+/// The accumulation of the patches of several batches in a strip.
+struct Accumulate<'a> {
+    patches: &'a [f32],
+    row_length: usize,
+    groups: &'a [u32],
+    strip: Strip<'a>,
+}
+
+impl WithSimd for Accumulate<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { patches, row_length, groups, mut strip } = self;
+        let batches = groups.chunks(BATCH * PATCHES).zip(patches.chunks_exact(BATCH_VALUES));
+        for (batch, patches) in batches {
+            scatter::<S>(patches, row_length, batch, &mut strip);
         }
     }
 }
@@ -337,14 +459,21 @@ fn gather<S: Simd>(clip: &[f32], row_length: usize, batch: &[u32], patches: &mut
     }
 }
 
+/// Adds the rows of patches that are in the strip.
 #[inline(always)]
-fn scatter<S: Simd>(patches: &[f32], row_length: usize, batch: &[u32], sum: &mut [f32]) {
+fn scatter<S: Simd>(patches: &[f32], row_length: usize, batch: &[u32], strip: &mut Strip<'_>) {
+    let end = strip.first + strip.values.len();
     for patch in 0..PATCHES {
         for (index, group) in batch.chunks_exact(PATCHES).enumerate() {
-            let values = &patches[place_of::<S>(index, patch)..][..span::<S>()];
             let start = group[patch] as usize;
+            if start >= end || start + SIDE * row_length <= strip.first {
+                continue;
+            }
+            let values = &patches[place_of::<S>(index, patch)..][..span::<S>()];
             for i in 0..SIDE {
-                let row = &mut sum[start + i * row_length..][..SIDE];
+                // Below 0 it is a large number, which is outside as well.
+                let at = (start + i * row_length).wrapping_sub(strip.first);
+                let Some(row) = strip.values.get_mut(at..at.wrapping_add(SIDE)) else { continue };
                 for (j, pixel) in row.iter_mut().enumerate() {
                     *pixel += values[(i * SIDE + j) * PATCHES * S::F32_LANES];
                 }
@@ -361,9 +490,12 @@ fn span<S: Simd>() -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::layout::{PATCHES, PIXELS, REACH, SIDE, positions, shift};
+    use super::layout::{BATCH, PATCHES, PIXELS, REACH, SIDE, positions, shift};
     use super::search::window;
-    use super::{Nonlocal, OUTLIER_LIMIT, REFRESH, STRENGTH, limit_outliers, temporal_shrinkage};
+    use super::{
+        BATCHES_AT_ONCE, Nonlocal, OUTLIER_LIMIT, REFRESH, STRENGTH, limit_outliers,
+        temporal_shrinkage,
+    };
     use ndarray::{Array2, Array3};
     use pulp::Arch;
     use rand::{RngExt, SeedableRng};
@@ -571,6 +703,26 @@ mod tests {
                 let worst = (&found - &expected).mapv(f32::abs).fold(0.0, |a: f32, &b| a.max(b));
                 assert!(worst < 2e-5, "{size:?} pass {pass}: {worst}");
             }
+        }
+    }
+
+    /// More batches of groups than are filtered at once.
+    #[test]
+    fn the_number_of_cores_does_not_matter() {
+        let size = (5, 90, 85);
+        let passes = |counts: [usize; 2]| {
+            let (_, mut clip) = noisy(size, 0.1);
+            let mut prior = Nonlocal::new(size);
+            for pass in 0..REFRESH + 2 {
+                prior.cores.set(counts[pass % 2]);
+                prior.denoise(&mut clip, 0.05, 0.4);
+            }
+            assert!(prior.groups.len() > BATCHES_AT_ONCE * BATCH * PATCHES);
+            clip
+        };
+        let alone = passes([1, 1]);
+        for counts in [[2, 2], [3, 8], [1, 2]] {
+            assert_eq!(passes(counts), alone, "{counts:?} cores");
         }
     }
 

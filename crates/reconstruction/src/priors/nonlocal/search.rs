@@ -16,81 +16,95 @@ pub(super) const ROWS: usize = 8;
 /// Largest number of candidates that a group keeps between frames; beyond it, only the best [`PATCHES`] stay.
 const KEPT: usize = 128;
 
-/// Finds the patches most similar to each reference patch, near it in time and near the place where its motion leads,
-/// and counts how many cover each pixel. The grid of references depends on the number of earlier searches. Among
-/// equally similar patches, the first in the clip is taken. The patches of a group are in the order of the clip.
+/// A row of reference patches.
+pub(super) struct Line {
+    frame: usize,
+    row: usize,
+    columns: Vec<usize>,
+}
+
+impl Line {
+    /// Number of references, and so of groups.
+    pub(super) fn len(&self) -> usize {
+        self.columns.len()
+    }
+}
+
+/// All rows of reference patches. Their grid depends on the number of earlier searches.
+pub(super) fn lines((frames, height, width): Size, searches: usize) -> Vec<Line> {
+    let frame_lines = |frame| {
+        let (down, right) = shift(frame, searches);
+        let columns = positions(width, right);
+        let line = move |row| Line { frame, row, columns: columns.clone() };
+        positions(height, down).into_iter().map(line)
+    };
+    (0..frames).flat_map(frame_lines).collect()
+}
+
+/// Finds the patches most similar to each reference patch of a line, near it in time and near the place where its motion
+/// leads. Among equally similar patches, the first in the clip is taken. `groups` receives [`PATCHES`] for each reference, in
+/// the order of the clip.
 #[inline(always)]
 pub(super) fn search<S: Simd>(
     simd: S,
-    guide: &[f32],
-    size: Size,
-    searches: usize,
+    clip: (&[f32], Size),
+    line: &Line,
     motion: &Motion,
-    groups: &mut Vec<u32>,
-    cover: &mut [f32],
+    best: &mut Best,
+    groups: &mut [u32],
 ) {
     match S::F32_LANES {
-        16 => search_with::<S, { WINDOW / 16 }>(simd, guide, size, searches, motion, groups),
-        8 => search_with::<S, { WINDOW / 8 }>(simd, guide, size, searches, motion, groups),
-        4 => search_with::<S, { WINDOW / 4 }>(simd, guide, size, searches, motion, groups),
-        _ => search_with::<S, WINDOW>(simd, guide, size, searches, motion, groups),
+        16 => search_with::<S, { WINDOW / 16 }>(simd, clip, line, motion, best, groups),
+        8 => search_with::<S, { WINDOW / 8 }>(simd, clip, line, motion, best, groups),
+        4 => search_with::<S, { WINDOW / 4 }>(simd, clip, line, motion, best, groups),
+        _ => search_with::<S, WINDOW>(simd, clip, line, motion, best, groups),
     }
-    count_cover(groups, cover, row_length(size.2));
 }
 
 /// The search with `V` vectors for a row of a window.
 #[inline(always)]
 fn search_with<S: Simd, const V: usize>(
     simd: S,
-    guide: &[f32],
-    (frames, height, width): Size,
-    searches: usize,
+    (guide, (frames, height, width)): (&[f32], Size),
+    &Line { frame, row, ref columns }: &Line,
     motion: &Motion,
-    groups: &mut Vec<u32>,
+    best: &mut Best,
+    groups: &mut [u32],
 ) {
     let row_length = row_length(width);
     let plane = height * row_length;
-    let mut best = Best::default();
-    groups.clear();
-    for frame in 0..frames {
-        let near = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
-        // The reference's frame first: it probably has the most similar patches, and the bound falls at once.
-        let order = || [frame].into_iter().chain(near.clone().filter(|&other| other != frame));
-        let (down, right) = shift(frame, searches);
-        let (rows, columns) = (positions(height, down), positions(width, right));
-        for (&row, &column) in rows.iter().flat_map(|row| columns.iter().map(move |c| (row, c))) {
-            let motion = motion.at(row + SIDE / 2, column + SIDE / 2);
-            let rows_in = |k: usize| window(moved(row, motion.0, frame, k), height);
-            let columns_in = |k: usize| window(moved(column, motion.1, frame, k), width);
-            let reference = frame * plane + row * row_length + column;
-            best.clear();
-            for (other, first) in
-                order().flat_map(|k| rows_in(k).step_by(ROWS).map(move |i| (k, i)))
-            {
-                if other != frame {
-                    best.reduce(KEPT);
-                }
-                let (top, left) = (rows_in(other), columns_in(other));
-                let start = other * plane + first * row_length + left.start;
-                let distances = distances::<S, V>(simd, guide, reference, start, row_length);
-                let starts = (start..).step_by(row_length).take(top.end - first);
-                for (row, start) in distances.iter().zip(starts) {
-                    let bound = simd.splat_f32s(best.bound);
-                    let below = |&part| simd.first_true_m32s(simd.less_than_f32s(part, bound));
-                    if row.iter().any(|part| below(part) < S::F32_LANES) {
-                        best.add(&bytemuck::cast_slice(row)[..left.len()], start);
-                    }
-                }
-                if (first..first + ROWS).contains(&row) && other == frame {
-                    best.put_first(reference);
+    let reach = frame.saturating_sub(REACH)..(frame + REACH + 1).min(frames);
+    // The reference's frame first: it probably has the most similar patches, and the bound falls at once.
+    let order = || [frame].into_iter().chain(reach.clone().filter(|&other| other != frame));
+    for (&column, group) in columns.iter().zip(groups.chunks_exact_mut(PATCHES)) {
+        let motion = motion.at(row + SIDE / 2, column + SIDE / 2);
+        let rows_in = |k: usize| window(moved(row, motion.0, frame, k), height);
+        let columns_in = |k: usize| window(moved(column, motion.1, frame, k), width);
+        let reference = frame * plane + row * row_length + column;
+        best.clear();
+        for (other, first) in order().flat_map(|k| rows_in(k).step_by(ROWS).map(move |i| (k, i))) {
+            if other != frame {
+                best.reduce(KEPT);
+            }
+            let (top, left) = (rows_in(other), columns_in(other));
+            let start = other * plane + first * row_length + left.start;
+            let distances = distances::<S, V>(simd, guide, reference, start, row_length);
+            let starts = (start..).step_by(row_length).take(top.end - first);
+            for (row, start) in distances.iter().zip(starts) {
+                let bound = simd.splat_f32s(best.bound);
+                let below = |&part| simd.first_true_m32s(simd.less_than_f32s(part, bound));
+                if row.iter().any(|part| below(part) < S::F32_LANES) {
+                    best.add(&bytemuck::cast_slice(row)[..left.len()], start);
                 }
             }
-            best.reduce(PATCHES);
-            // A clip too small for a full group repeats its patches.
-            let start = groups.len();
-            groups.extend(best.places().cycle().take(PATCHES));
-            groups[start..].sort_unstable();
+            if (first..first + ROWS).contains(&row) && other == frame {
+                best.put_first(reference);
+            }
         }
+        best.reduce(PATCHES);
+        // A clip too small for a full group repeats its patches.
+        group.iter_mut().zip(best.places().cycle()).for_each(|(slot, place)| *slot = place);
+        group.sort_unstable();
     }
 }
 
@@ -107,7 +121,7 @@ pub(super) fn window(at: usize, length: usize) -> Range<usize> {
 }
 
 /// The candidates of a group.
-struct Best {
+pub(super) struct Best {
     /// Distance (the bits of a positive float sort like the float), then position: the order is total.
     keys: Vec<u64>,
     count: usize,
@@ -201,8 +215,8 @@ fn distances<S: Simd, const V: usize>(
     sums
 }
 
-/// Number of patches that cover each pixel: box sums, over squares of `SIDE`, of the patches that begin at a pixel.
-fn count_cover(groups: &[u32], cover: &mut [f32], row_length: usize) {
+/// Counts how many patches cover each pixel: box sums, over squares of `SIDE`, of the patches that begin at a pixel.
+pub(super) fn count_cover(groups: &[u32], cover: &mut [f32], row_length: usize) {
     cover.fill(0.0);
     for &place in groups.iter() {
         cover[place as usize] += 1.0;
