@@ -42,12 +42,12 @@ where
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self> {
         let raw = RawPathParams::from_request_parts(parts, state).await;
-        let raw = raw.map_err(|error| ApiError::internal(&error))?;
-        // Values of other kinds, such as hashes, are too long for a number.
-        let is_number = |value: &str| value.parse::<u32>().is_ok();
-        let longer =
-            |&(_, value): &(&str, &str)| is_number(value) && canonical_number(value).is_none();
-        if let Some((name, value)) = raw.iter().find(longer) {
+        let raw = raw.map_err(|error| ApiError::new(Code::NotFound, error.body_text()))?;
+        // Names of labs may look like numbers. Hashes are too long for one.
+        let is_odd = |&(name, value): &(&str, &str)| {
+            name != "lab" && value.parse::<u32>().is_ok() && canonical_number(value).is_none()
+        };
+        if let Some((name, value)) = raw.iter().find(is_odd) {
             let detail =
                 format!("{name} is {value}: write the number without a sign and leading zeros");
             return Err(ApiError::new(Code::NotFound, detail));

@@ -520,8 +520,8 @@ async fn mistakes_on_the_command_line_are_named() {
     lab.write("flag.toml", b"[serve]\nunconfined = 2");
     let made = std::process::Command::new("mkfifo").arg(lab.path("pipe.npy")).status().unwrap();
     assert!(made.success());
-    for (line, expected) in [
-        (&["--config", "table.toml", "config", "show", "serve"][..], "a line [serve]"),
+    let cases: [(&[&str], &str); 6] = [
+        (&["--config", "table.toml", "config", "show", "serve"], "a line [serve]"),
         (&["--config", "value.toml", "config", "show", "serve"], "value.toml"),
         (&["--config", "flag.toml", "config", "show", "serve"], "true or false"),
         (&["serve", "--data", "d", "--max-uploads", "0"], "--max-uploads"),
@@ -531,7 +531,8 @@ async fn mistakes_on_the_command_line_are_named() {
             &["reconstruct", "--masks", "pipe.npy", "--measurement", "pipe.npy"],
             "not a regular file",
         ),
-    ] {
+    ];
+    for (line, expected) in cases {
         let text = lab.refused(2, line).await;
         assert!(text.contains(expected), "{line:?}: {text}");
     }

@@ -287,6 +287,7 @@ async fn messages_say_which_value_is_wrong_and_which_are_accepted() {
         ("/v1/jobs?lab=*&lab=local".to_owned(), 400, "more than once"),
         (format!("/v1/jobs/{job}/snapshots/+0/exports/npy"), 404, "snapshot is +0"),
         (format!("/v1/jobs/{job}/snapshots/00"), 404, "snapshot is 00"),
+        ("/v1/jobs/%FF".to_owned(), 404, "UTF-8"),
     ];
     for (path, status, expected) in gets {
         let answer = app.get(&path).await;
@@ -303,7 +304,7 @@ async fn messages_say_which_value_is_wrong_and_which_are_accepted() {
     let window = |black: f64, white: f64| json!({"format": "gif", "black": black, "white": white});
     for (path, body, expected) in [
         (&*exports, window(-3.4e38, 3.4e38), "black is -3.4e38 and white is 3.4e38; both and"),
-        (&exports, window(2.0, 1.0), "black must be below white"),
+        (&*exports, window(2.0, 1.0), "black must be below white"),
         ("/v1/jobs", with("label", json!(long)), "the text has 3000 characters; at most 200"),
         ("/v1/jobs", with("webhook", json!("lab")), "such as https://lab.example/hooks/sci-recon"),
         ("/v1/jobs", with("snapshots", json!({"first": 0, "last": 1})), "[first, last]"),
