@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bytesize::ByteSize;
+use clap::builder::RangedU64ValueParser;
 use clap::{Args, ValueEnum};
 use hyper::http::{HeaderValue, Uri};
 use ipnet::IpNet;
@@ -90,16 +91,17 @@ pub struct ServeArguments {
 
     /// Memory that a worker may need; jobs that need more are refused. A task fails if it takes more than 1.25
     /// times this plus 256 MiB.
-    #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 4 << 30)]
+    #[arg(long, env = "SCI_RECON_WORKER_MEMORY_BYTES", value_name = "BYTES", value_parser = some_bytes, default_value_t = 4 << 30)]
     pub worker_memory_bytes: u64,
 
     /// Largest size of an upload.
-    #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", value_parser = bytes, default_value_t = 8 << 30)]
+    #[arg(long, env = "SCI_RECON_MAX_UPLOAD_BYTES", value_name = "BYTES", value_parser = some_bytes, default_value_t = 8 << 30)]
     pub max_upload_bytes: u64,
 
     /// Uploads that are received at the same time; further ones must try again later. A lab has at most half of
     /// these places. A lab without an upload always gets one.
-    #[arg(long, env = "SCI_RECON_MAX_UPLOADS", value_name = "N", default_value_t = 64)]
+    #[arg(long, env = "SCI_RECON_MAX_UPLOADS", value_name = "N", default_value_t = 64,
+          value_parser = RangedU64ValueParser::<usize>::new().range(1..))]
     pub max_uploads: usize,
 
     /// Bytes of the disk to keep free of uploads.
@@ -111,7 +113,8 @@ pub struct ServeArguments {
         long,
         env = "SCI_RECON_UPLOAD_IDLE_SECONDS",
         value_name = "SECONDS",
-        default_value_t = 60
+        default_value_t = 60,
+        value_parser = clap::value_parser!(u64).range(1..)
     )]
     pub upload_idle_seconds: u64,
 
@@ -146,7 +149,8 @@ pub struct ServeArguments {
     pub download_bytes_per_second: u64,
 
     /// Seconds that an answer may take (other than uploads, checks of uploads, and downloads).
-    #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30)]
+    #[arg(long, env = "SCI_RECON_REQUEST_SECONDS", value_name = "SECONDS", default_value_t = 30,
+          value_parser = clap::value_parser!(u64).range(1..))]
     pub request_seconds: u64,
 
     /// Seconds that the check of a file for a calibration or measurement may take.
@@ -159,7 +163,8 @@ pub struct ServeArguments {
 
     /// Jobs that may wait and run; further ones must try again later, except those of a lab with less than an
     /// equal share.
-    #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000)]
+    #[arg(long, env = "SCI_RECON_MAX_JOBS", value_name = "N", default_value_t = 1000,
+          value_parser = clap::value_parser!(u64).range(1..))]
     pub max_jobs: u64,
 
     /// Jobs of one lab that may wait and run, if there are several labs; `lab set --jobs` sets a limit for one lab
@@ -462,6 +467,14 @@ pub fn bytes(text: &str) -> Result<u64, String> {
         .map_err(|_| format!("{text:?} is not a size such as 1000000, 10GB or 8GiB"))
 }
 
+/// A number of bytes above 0.
+fn some_bytes(text: &str) -> Result<u64, String> {
+    match bytes(text)? {
+        0 => Err("0 would refuse everything; state a size such as 10GB or 8GiB".into()),
+        size => Ok(size),
+    }
+}
+
 /// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum LogFormat {
@@ -630,6 +643,25 @@ mod tests {
         let error = serve(&["--listen", "0.0.0.0:80"]).unwrap_err().to_string();
         assert!(error.contains("--allow-remote"), "{error}");
         assert!(serve(&["--listen", "0.0.0.0:80", "--allow-remote"]).is_ok());
+    }
+
+    #[test]
+    fn limits_that_would_refuse_everything_are_refused() {
+        for option in [
+            "max-uploads",
+            "max-jobs",
+            "worker-memory-bytes",
+            "max-upload-bytes",
+            "request-seconds",
+            "upload-idle-seconds",
+        ] {
+            let serve = |value: &str| {
+                let option = format!("--{option}={value}");
+                Serve::try_parse_from(["serve", "--data", "d", &option])
+            };
+            assert!(serve("0").unwrap_err().to_string().contains(option));
+            assert!(serve("1").is_ok(), "{option}");
+        }
     }
 
     #[test]

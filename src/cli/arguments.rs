@@ -16,6 +16,7 @@ use engine::job::{
 };
 use engine::pipeline::NetworkSource;
 use formats::{Axes, Crop, Packing};
+use optics::MAX_BANDS;
 use reconstruction::priors::onnx::Device;
 use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
@@ -130,9 +131,13 @@ impl FromStr for Numbers {
         let number =
             |text: &str| text.trim().parse::<f64>().map_err(|_| format!("{text:?} is no number"));
         if let [start, step, count] = text.split(':').collect::<Vec<_>>()[..]
-            && let Ok(count) = count.trim().parse::<u16>()
+            && let (Ok(start), Ok(step)) = (number(start), number(step))
         {
-            let (start, step) = (number(start)?, number(step)?);
+            let count = count.trim();
+            let count = count.parse::<u16>().ok().filter(|count| usize::from(*count) <= MAX_BANDS);
+            let count = count.ok_or_else(|| {
+                format!("COUNT in {text:?} is not a whole number from 1 to {MAX_BANDS}")
+            })?;
             return Ok(Self((0..count).map(|band| start + step * f64::from(band)).collect()));
         }
         if text.contains(',') || number(text).is_ok() {

@@ -435,18 +435,18 @@ impl<'a> Input<'a> {
             let text = "--registration: masks of a colour sensor or spectral camera are not moved; calibrate again";
             return Err(CliError::Input(text.into()));
         }
-        let light = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0));
+        let light =
+            || Ok(masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0)));
         let y = &self.measurement.array.index_axis(Axis(0), 0) / white;
         let piece = |place: &Window| {
             Ok(masks.slice(s![.., place.rows.clone(), place.columns.clone()]).to_owned())
         };
-        let (light, y) = (light.view(), y.view());
         let registered =
-            registration::register(request, is_coloured, light, y, piece, &mut |_| true)?;
+            registration::register(request, is_coloured, light, y.view(), piece, &mut |_| true)?;
         if let Some(registered) = &registered {
             let superseded = registered.superseded();
             self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
-            self.findings.extend(registered.finding());
+            self.findings.extend(registered.findings());
         }
         if let Some(shift) = registered.as_ref().and_then(Registered::applied_shift) {
             let moved = registration::moved(masks, shift);

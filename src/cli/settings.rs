@@ -11,7 +11,7 @@ use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::path::PathBuf;
 
-use clap::error::{ContextKind, ContextValue};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Command};
 use toml::{Table, Value};
@@ -97,7 +97,7 @@ pub fn expand(root: &Command, line: Vec<OsString>) -> Result<Expanded> {
 }
 
 /// A table of all options of a command with their values and origins; `rest` stands for its command line.
-/// Errors: those of [`expand`]; an unknown command.
+/// Errors: those of [`expand`]; an unknown command; values that the command would refuse.
 pub fn show(
     root: &Command,
     names: &[String],
@@ -115,6 +115,7 @@ pub fn show(
     let line: Vec<OsString> = [OsString::from(PROGRAM)].into_iter().chain(words).collect();
     let matches = lenient(root, &line).map_err(|error| CliError::Input(error.to_string()))?;
     let path = path.or_else(|| path_in(&matches));
+    check_values(root, &line, path.as_ref())?;
     let file = path.map(|path| File::read(root, path)).transpose()?;
     let mut set = &matches;
     while let Some((_, below)) = set.subcommand() {
@@ -129,6 +130,35 @@ pub fn show(
         lines.push(format!("{:24}{value:40}{from}", arg.get_long().unwrap_or_default()));
     }
     Ok(lines.join("\n"))
+}
+
+/// Refuses values of a line and of its configuration file as the command itself would. Required options may be missing.
+fn check_values(root: &Command, line: &[OsString], path: Option<&PathBuf>) -> Result<()> {
+    use ErrorKind::{
+        ArgumentConflict, InvalidUtf8, InvalidValue, TooManyValues, ValueValidation,
+        WrongNumberOfValues,
+    };
+    let config = path.map(|path| [OsString::from(format!("--{CONFIG}")), path.into()]);
+    let (program, rest) = line.split_at(line.len().min(1));
+    let line =
+        program.iter().cloned().chain(config.into_iter().flatten()).chain(rest.iter().cloned());
+    let expanded = expand(root, line.collect())?;
+    let Err(error) = root.clone().try_get_matches_from(&expanded.line) else { return Ok(()) };
+    let refused = [
+        ArgumentConflict,
+        InvalidUtf8,
+        InvalidValue,
+        TooManyValues,
+        ValueValidation,
+        WrongNumberOfValues,
+    ];
+    if !refused.contains(&error.kind()) {
+        return Ok(());
+    }
+    let text = error.to_string();
+    let text = text.lines().next().unwrap_or_default().trim_start_matches("error: ");
+    let origin = expanded.origin_of(&error).map_or(String::new(), |origin| format!("; {origin}"));
+    Err(CliError::Input(format!("{text}{origin}")))
 }
 
 /// Origin of an option that is not set.
@@ -285,6 +315,10 @@ fn check(table: &Table, command: &Command, heading: &str) -> Result<(), String> 
             continue;
         }
         let keys = keys(command);
+        if command.find_subcommand(key).is_some() && !keys.contains(&key.as_str()) {
+            let place = if heading.is_empty() { key.clone() } else { format!("{heading}.{key}") };
+            return Err(format!("{place} is a command: write its options below a line [{place}]"));
+        }
         if value.is_table() {
             let names = command.get_subcommands().map(Command::get_name);
             return Err(format!("there is no command {key:?}{}", nearest(key, names)));
@@ -451,6 +485,8 @@ mod tests {
                 "[token.create]\nlabs = 1",
                 "token.create has no option \"labs\"; did you mean \"lab\"?",
             ),
+            ("serve = 1", "serve is a command: write its options below a line [serve]"),
+            ("[token]\ncreate = 1", "write its options below a line [token.create]"),
             ("[server]\nmost = 1", "there is no command \"server\"; did you mean \"serve\"?"),
             ("[serve]\nmost = 2001-01-01", "most must be a text, a number"),
             ("[serve]\nmost = [1, 2]", "most must be one value"),
@@ -503,6 +539,16 @@ mod tests {
         assert_eq!(line("host"), ["host", "a,b", "the", "command", "line"]);
         assert_eq!(line("masks"), ["masks", "-", "the", "default"]);
         assert!(shown(&["token", "create"], &[]).contains("lab                     l  "));
+        fs::write(&file, "most = \"many\"").unwrap();
+        let number = |arg: Arg| arg.value_parser(value_parser!(u32));
+        let root_with_number =
+            root().mut_subcommand("serve", |serve| serve.mut_arg("most", number));
+        let serve = ["serve".to_owned()];
+        let refused =
+            show(&root_with_number, &serve, &[], Some(file.clone())).unwrap_err().to_string();
+        assert!(refused.contains("many") && refused.contains("sci.toml"), "{refused}");
+        let refused = show(&root_with_number, &serve, &["--most=x".into()], None).unwrap_err();
+        assert!(refused.to_string().contains("--most"), "{refused}");
         let error = show(&root(), &["sreve".to_owned()], &[], None).unwrap_err().to_string();
         assert!(error.contains("did you mean \"serve\"?"), "{error}");
     }

@@ -281,8 +281,12 @@ async fn choose_lab(
     mut access: Access,
     request: &mut Request,
 ) -> Result<Access> {
-    let (wanted, rest) = without_lab(request.uri());
-    let Some(wanted) = wanted else { return Ok(access) };
+    let (mut labs, rest) = without_lab(request.uri());
+    let Some(wanted) = labs.pop() else { return Ok(access) };
+    if !labs.is_empty() {
+        let detail = "the parameter lab occurs more than once; name one lab, or * for all";
+        return Err(ApiError::new(Code::InvalidQuery, detail));
+    }
     *request.uri_mut() = rest;
     if wanted == access.lab.as_str() {
         return Ok(access);
@@ -291,7 +295,7 @@ async fn choose_lab(
         let detail = format!("the token is for the lab {} alone", access.lab);
         return Err(ApiError::new(Code::Forbidden, detail));
     }
-    if wanted == "*" && rule == Rule::AcrossLabs {
+    if wanted == "*" && rule == Rule::AcrossLabs && request.method().is_safe() {
         access.across = true;
         return Ok(access);
     }
@@ -305,16 +309,17 @@ async fn choose_lab(
     }
 }
 
-/// The parameter `lab`, and the address without it.
-fn without_lab(uri: &Uri) -> (Option<String>, Uri) {
+/// The values of the parameter `lab`, and the address without it.
+fn without_lab(uri: &Uri) -> (Vec<String>, Uri) {
     let pairs = || uri.query().unwrap_or_default().split('&');
-    let lab = pairs().find_map(|pair| pair.strip_prefix("lab="));
-    let Some(lab) = lab.map(|lab| lab.replace("%2A", "*").replace("%2a", "*")) else {
-        return (None, uri.clone());
-    };
+    let labs = pairs().filter_map(|pair| pair.strip_prefix("lab="));
+    let labs: Vec<_> = labs.map(|lab| lab.replace("%2A", "*").replace("%2a", "*")).collect();
+    if labs.is_empty() {
+        return (labs, uri.clone());
+    }
     let rest: Vec<_> = pairs().filter(|pair| !pair.starts_with("lab=")).collect();
     let rest = format!("{}?{}", uri.path(), rest.join("&"));
-    (Some(lab), rest.parse().unwrap_or_else(|_| uri.clone()))
+    (labs, rest.parse().unwrap_or_else(|_| uri.clone()))
 }
 
 fn text<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
@@ -475,11 +480,12 @@ mod tests {
     #[test]
     fn the_lab_is_taken_out_of_the_query() {
         let of = |text: &str| {
-            let (lab, rest) = without_lab(&text.parse().unwrap());
-            (lab.unwrap_or_default(), rest.to_string())
+            let (labs, rest) = without_lab(&text.parse().unwrap());
+            (labs.join(" "), rest.to_string())
         };
         assert_eq!(of("/v1/jobs?limit=2&lab=a&x=1"), ("a".into(), "/v1/jobs?limit=2&x=1".into()));
         assert_eq!(of("/v1/jobs?lab=%2A").0, "*");
+        assert_eq!(of("/v1/jobs?lab=a&lab=b"), ("a b".into(), "/v1/jobs?".into()));
         assert_eq!(of("/v1/jobs?label=a"), (String::new(), "/v1/jobs?label=a".into()));
         assert_eq!(of("/v1/jobs"), (String::new(), "/v1/jobs".into()));
     }

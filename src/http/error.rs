@@ -338,8 +338,8 @@ impl From<StoreError> for ApiError {
             }
             StoreError::DatabaseGone(_) => {
                 tracing::error!(%error, "a change is refused");
-                let detail = "the database of the service was removed, replaced or truncated, so nothing is changed: \
-                              its administrator must restore it";
+                let detail = "the data folder or the database of the service was moved, removed, replaced or truncated, so \
+                              nothing is changed: its administrator must restore it";
                 return Self::new(Code::Unavailable, detail);
             }
             busy if busy.is_busy() => {

@@ -2,7 +2,7 @@
 
 use axum::body::Bytes;
 use axum::extract::rejection::{BytesRejection, PathRejection, QueryRejection};
-use axum::extract::{FromRequest, FromRequestParts, Path, Query, Request};
+use axum::extract::{FromRequest, FromRequestParts, Path, Query, RawPathParams, Request};
 use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use base64::Engine;
@@ -28,7 +28,8 @@ impl FromRequestParts<App> for Caller {
     }
 }
 
-/// The parameters of the path. A malformed identifier is answered with 404, like an unknown one.
+/// The parameters of the path. A malformed identifier is answered with 404, like an unknown one. So is a number with a sign
+/// or leading zeros.
 #[derive(Debug)]
 pub(super) struct Params<T>(pub(super) T);
 
@@ -40,6 +41,17 @@ where
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self> {
+        let raw = RawPathParams::from_request_parts(parts, state).await;
+        let raw = raw.map_err(|error| ApiError::new(Code::NotFound, error.body_text()))?;
+        // Names of labs may look like numbers. Hashes are too long for one.
+        let is_odd = |&(name, value): &(&str, &str)| {
+            name != "lab" && value.parse::<u32>().is_ok() && canonical_number(value).is_none()
+        };
+        if let Some((name, value)) = raw.iter().find(is_odd) {
+            let detail =
+                format!("{name} is {value}: write the number without a sign and leading zeros");
+            return Err(ApiError::new(Code::NotFound, detail));
+        }
         match Path::<T>::from_request_parts(parts, state).await {
             Ok(Path(params)) => Ok(Self(params)),
             Err(PathRejection::FailedToDeserializePathParams(error)) => {
@@ -65,7 +77,18 @@ where
         match Query::<T>::from_request_parts(parts, state).await {
             Ok(Query(query)) => Ok(Self(query)),
             Err(QueryRejection::FailedToDeserializeQueryString(error)) => {
-                Err(ApiError::new(Code::InvalidQuery, error.body_text()))
+                let text = error.body_text();
+                // The standard library's errors of numbers name neither a form nor a range.
+                let number = [
+                    "invalid digit found in string",
+                    "number too large to fit in target type",
+                    "cannot parse integer from empty string",
+                ];
+                let cause = number.iter().find_map(|cause| text.strip_suffix(cause));
+                let text = cause
+                    .map(|place| format!("{place}a whole number from 0 on is expected"))
+                    .unwrap_or(text);
+                Err(ApiError::new(Code::InvalidQuery, text))
             }
             Err(error) => Err(ApiError::internal(&error)),
         }
@@ -113,15 +136,19 @@ pub(super) fn check_encoding(headers: &HeaderMap) -> Result<()> {
         .with_header(header::ACCEPT_ENCODING, identity))
 }
 
-/// The SHA-256 in `Content-Digest` (RFC 9530), if there is one. Other algorithms are ignored.
+/// The SHA-256 in `Content-Digest` (RFC 9530); `None` without this header. Further algorithms are ignored. A header without
+/// SHA-256 is refused, because nothing would be checked.
 pub(super) fn content_digest(headers: &HeaderMap) -> Result<Option<Sha256>> {
     let malformed = || {
-        let detail = "sha-256 in Content-Digest must be 32 bytes in base64 between colons";
+        let detail = "Content-Digest must have a member sha-256=:DIGEST:, with 32 bytes in base64 between the colons";
         ApiError::new(Code::MalformedRequest, detail)
     };
+    if !headers.contains_key("content-digest") {
+        return Ok(None);
+    }
     for value in headers.get_all("content-digest") {
         for member in value.to_str().map_err(|_| malformed())?.split(',') {
-            let Some((name, digest)) = member.trim().split_once('=') else { continue };
+            let (name, digest) = member.trim().split_once('=').ok_or_else(malformed)?;
             if name != "sha-256" {
                 continue;
             }
@@ -130,7 +157,7 @@ pub(super) fn content_digest(headers: &HeaderMap) -> Result<Option<Sha256>> {
             return Ok(Some(Sha256::new(bytes.try_into().map_err(|_| malformed())?)));
         }
     }
-    Ok(None)
+    Err(malformed())
 }
 
 /// Rejects a body with another hash than `Content-Digest` states.
@@ -167,7 +194,7 @@ fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T> {
         if inner.is_data() {
             ApiError::fields(
                 Code::InvalidRequest,
-                vec![InvalidField::new(pointer, inner.to_string())],
+                vec![InvalidField::new(pointer, without_position(&inner))],
             )
         } else {
             ApiError::new(Code::MalformedJson, inner.to_string())
@@ -175,6 +202,13 @@ fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T> {
     })?;
     deserializer.end().map_err(|error| ApiError::new(Code::MalformedJson, error.to_string()))?;
     Ok(value)
+}
+
+/// The message of an error in a field. The pointer names the place, so the line and the column are left out.
+fn without_position(error: &serde_json::Error) -> String {
+    let text = error.to_string();
+    let position = format!(" at line {} column {}", error.line(), error.column());
+    text.strip_suffix(&position).map(str::to_owned).unwrap_or(text)
 }
 
 fn pointer(path: &serde_path_to_error::Path) -> String {

@@ -55,7 +55,7 @@ pub(super) struct JobBody {
     priority: i32,
     /// The upload with the true frames; null if they are unknown.
     truth: Option<Sha256>,
-    /// Findings of the check of the measurement, `bad_calibration`, and `moved_masks`.
+    /// Findings of the check of the measurement, `bad_calibration`, `moved_masks` and `misplaced_masks`.
     warnings: Vec<Finding>,
     /// The failure in words.
     error: Option<String>,
@@ -76,7 +76,9 @@ pub(super) struct JobBody {
 #[derive(Debug, Serialize, schemars::JsonSchema)]
 #[schemars(rename = "JobWebhook")]
 struct WebhookBody {
-    url: Webhook,
+    /// Scheme and host of the address, such as `https://lab.example`. Path and query may hold a secret of the receiver, so
+    /// they are not shown.
+    url: String,
     state: WebhookState,
     /// Failed attempts since the job ended.
     attempts: u32,
@@ -102,7 +104,7 @@ enum WebhookState {
 
 impl WebhookBody {
     async fn new(app: &App, job: &Job) -> Result<Option<Self>> {
-        let Some(url) = job.spec.webhook.clone() else { return Ok(None) };
+        let Some(url) = job.spec.webhook.as_ref().map(Webhook::origin) else { return Ok(None) };
         let delivery = app.store.delivery(job).await?;
         let state = match &delivery {
             _ if !job.state.is_final() => WebhookState::Pending,

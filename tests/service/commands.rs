@@ -482,3 +482,58 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
     let all = app.get("/v1/jobs?limit=200").await.expect(200).json();
     assert_eq!(all["items"].as_array().unwrap().len(), 52);
 }
+
+#[cfg(unix)]
+#[tokio::test]
+async fn a_watched_folder_reports_files_that_it_skips() {
+    use std::os::unix::ffi::OsStringExt;
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new(format!("http://{}", app.address()), "");
+    lab.write("masks.npy", &SCENE.masks());
+    std::fs::create_dir(lab.path("bench")).unwrap();
+    lab.write("bench/empty.npy", b"");
+    std::os::unix::fs::symlink(lab.path("masks.npy"), lab.path("bench/link.npy")).unwrap();
+    let unreadable = std::ffi::OsString::from_vec(b"bench/\xff.npy".to_vec());
+    std::fs::write(lab.folder.path().join(unreadable), SCENE.snapshots()).unwrap();
+    lab.write("bench/notes.txt", b"");
+    let watch = ["watch-folder", "bench", "--once", "--settle-seconds", "0.1"];
+    let watched = lab.run(&[&watch[..], &["--masks", "masks.npy"]].concat()).await;
+    let text = String::from_utf8(watched.stdout).unwrap();
+    assert_eq!(watched.status.code(), Some(1), "{text}");
+    for expected in [
+        "empty.npy is skipped: the file is empty",
+        "link.npy is skipped: it is a symbolic link",
+        "is not UTF-8",
+    ] {
+        assert_eq!(text.matches(expected).count(), 1, "{text}");
+    }
+    assert!(!text.contains("notes.txt"), "{text}");
+    let errors = String::from_utf8(watched.stderr).unwrap();
+    assert!(errors.contains("3 files were skipped"), "{errors}");
+}
+
+#[tokio::test]
+async fn mistakes_on_the_command_line_are_named() {
+    let lab = Lab::new("http://127.0.0.1:1".to_owned(), "");
+    lab.write("table.toml", b"serve = 1");
+    lab.write("value.toml", b"[serve]\nlog-format = \"xml\"");
+    lab.write("flag.toml", b"[serve]\nunconfined = 2");
+    let made = std::process::Command::new("mkfifo").arg(lab.path("pipe.npy")).status().unwrap();
+    assert!(made.success());
+    let cases: [(&[&str], &str); 6] = [
+        (&["--config", "table.toml", "config", "show", "serve"], "a line [serve]"),
+        (&["--config", "value.toml", "config", "show", "serve"], "value.toml"),
+        (&["--config", "flag.toml", "config", "show", "serve"], "true or false"),
+        (&["serve", "--data", "d", "--max-uploads", "0"], "--max-uploads"),
+        (&["simulate", "--dispersion-offsets", "0:1:1000000"], "from 1 to 64"),
+        // Opening a pipe would wait for its writer.
+        (
+            &["reconstruct", "--masks", "pipe.npy", "--measurement", "pipe.npy"],
+            "not a regular file",
+        ),
+    ];
+    for (line, expected) in cases {
+        let text = lab.refused(2, line).await;
+        assert!(text.contains(expected), "{line:?}: {text}");
+    }
+}

@@ -60,7 +60,10 @@ async fn a_body_must_match_its_headers() {
     let digest = |request: RequestBuilder, value: &str| request.header("content-digest", value);
     app.send(digest(post(), OTHER)).await.problem(422, "hash_mismatch");
     app.send(digest(put(), OTHER)).await.problem(422, "hash_mismatch");
-    app.send(digest(post(), "sha-256=:x:")).await.problem(400, "malformed_request");
+    for unchecked in ["sha-256=:x:", "sha-512=:AA==:", "SHA-256=:AA==:", "nonsense", ""] {
+        let refused = app.send(digest(post(), unchecked)).await;
+        assert!(refused.problem(400, "malformed_request").contains("sha-256=:"), "{unchecked}");
+    }
     app.get(&format!("/v1/blobs/{hash}")).await.problem(404, "not_found");
     app.send(digest(post(), &format!("sha-512=:AA==:, {ABC}"))).await.expect(201);
     app.send(digest(put(), ABC)).await.expect(200);
@@ -249,4 +252,72 @@ async fn deleting_a_large_job_does_not_block_others() {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
     eprintln!("the delete took {took:?}, its files {:?} more", start.elapsed());
+}
+
+/// An administrator may move the folder by mistake, or its disk may be unmounted.
+#[tokio::test]
+async fn without_the_data_folder_the_answers_name_it_and_nothing_is_lost() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let request = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    let job = app.submit(&request).await;
+    app.ended(&job).await;
+    let result = format!("/v1/jobs/{job}/snapshots/0/exports/npy");
+    let frames = app.get(&result).await.expect(200);
+    let aside = app.data().with_extension("aside");
+    std::fs::rename(app.data(), &aside).unwrap();
+    for request in [
+        app.request(Method::POST, "/v1/blobs").body("important"),
+        app.request(Method::POST, "/v1/jobs").json(&request),
+        app.request(Method::GET, &result),
+    ] {
+        let detail = app.send(request).await.problem(503, "unavailable");
+        assert!(detail.contains("data folder"), "{detail}");
+    }
+    std::fs::rename(&aside, app.data()).unwrap();
+    assert_eq!(app.get_until(&result, 200).await.bytes, frames.bytes);
+}
+
+/// Files that nobody may change, not even root, until this is dropped.
+struct Immutable(Vec<std::path::PathBuf>);
+
+impl Immutable {
+    /// Prints a message and returns `None` if the disk or the user can't do this.
+    fn new(files: Vec<std::path::PathBuf>) -> Option<Self> {
+        let immutable = Self(files);
+        if immutable.set("+i") {
+            return Some(immutable);
+        }
+        eprintln!("SKIPPED: chattr +i needs root, and a disk that knows it");
+        None
+    }
+
+    fn set(&self, flag: &str) -> bool {
+        let mut command = std::process::Command::new("chattr");
+        let output = command.arg(flag).args(&self.0).output();
+        output.is_ok_and(|output| output.status.success())
+    }
+}
+
+impl Drop for Immutable {
+    fn drop(&mut self) {
+        self.set("-i");
+    }
+}
+
+/// A connection that SQLite has opened while the file was read-only stays read-only.
+#[tokio::test]
+async fn changes_are_possible_again_after_the_database_was_read_only() {
+    let app = TestApp::with(&["--workers", "0"]).await;
+    app.upload(b"before".to_vec()).await;
+    let files = ["sci-recon.db", "sci-recon.db-wal"].map(|name| app.data().join(name));
+    let Some(immutable) = Immutable::new(files.into()) else { return };
+    app.get_until("/readyz", 503).await;
+    for _ in 0..3 {
+        let upload = app.request(Method::POST, "/v1/blobs").body("during");
+        app.send(upload).await.problem(503, "unavailable");
+    }
+    drop(immutable);
+    app.get_until("/readyz", 200).await;
+    app.upload(b"after".to_vec()).await;
 }

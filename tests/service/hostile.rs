@@ -269,3 +269,50 @@ async fn a_request_with_two_hosts_is_rejected() {
         assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{lines:?}: {answer}");
     }
 }
+
+/// The messages name the field, its value and the accepted ones, in the terms of the user.
+#[tokio::test]
+async fn messages_say_which_value_is_wrong_and_which_are_accepted() {
+    let app = TestApp::with(&["--workers", "1", "--webhook-host", "lab.example"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    app.ended(&job).await;
+    let long = "x".repeat(3000);
+    let gets = [
+        ("/v1/jobs?limit=-1".to_owned(), 400, "whole number"),
+        ("/v1/jobs?limit=99999999999999999999".to_owned(), 400, "whole number"),
+        ("/v1/jobs?created_after=9999-12-31T23:59:59Z".to_owned(), 400, "is not from"),
+        ("/v1/jobs?created_after=2026-02-30T00:00:00Z".to_owned(), 400, "RFC 3339"),
+        (format!("/v1/jobs?search={long}"), 400, "the text has 3000 characters"),
+        ("/v1/jobs?lab=*&lab=local".to_owned(), 400, "more than once"),
+        (format!("/v1/jobs/{job}/snapshots/+0/exports/npy"), 404, "snapshot is +0"),
+        (format!("/v1/jobs/{job}/snapshots/00"), 404, "snapshot is 00"),
+        ("/v1/jobs/%FF".to_owned(), 404, "UTF-8"),
+    ];
+    for (path, status, expected) in gets {
+        let answer = app.get(&path).await;
+        let code = if status == 400 { "invalid_query" } else { "not_found" };
+        let detail = answer.problem(status, code);
+        assert!(detail.contains(expected), "{path}: {detail}");
+    }
+    let exports = format!("/v1/jobs/{job}/exports");
+    let with = |field: &str, value: Value| {
+        let mut body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+        body[field] = value;
+        body
+    };
+    let window = |black: f64, white: f64| json!({"format": "gif", "black": black, "white": white});
+    for (path, body, expected) in [
+        (&*exports, window(-3.4e38, 3.4e38), "black is -3.4e38 and white is 3.4e38; both and"),
+        (&*exports, window(2.0, 1.0), "black must be below white"),
+        ("/v1/jobs", with("label", json!(long)), "the text has 3000 characters; at most 200"),
+        ("/v1/jobs", with("webhook", json!("lab")), "such as https://lab.example/hooks/sci-recon"),
+        ("/v1/jobs", with("snapshots", json!({"first": 0, "last": 1})), "[first, last]"),
+    ] {
+        let answer = app.post(path, &body).await;
+        let detail = answer.problem(422, "invalid_request");
+        assert!(detail.contains(expected) && !detail.contains("at line"), "{path}: {detail}");
+    }
+    let across = app.post("/v1/jobs?lab=*", &with("priority", json!(0))).await;
+    assert!(across.problem(404, "not_found").contains("there is no lab"), "{across:?}");
+}

@@ -51,8 +51,13 @@ async fn run(app: &TestApp, measurement: &str, registration: &Value) -> (Value, 
     (ended, frames.bytes)
 }
 
+/// The finding of a job with this code.
+fn finding<'a>(job: &'a Value, code: &str) -> Option<&'a Value> {
+    job["warnings"].as_array().unwrap().iter().find(|finding| finding["code"] == code)
+}
+
 fn has_moved_masks(job: &Value) -> bool {
-    job["warnings"].as_array().unwrap().iter().any(|finding| finding["code"] == "moved_masks")
+    finding(job, "moved_masks").is_some()
 }
 
 #[tokio::test]
@@ -107,4 +112,47 @@ async fn masks_that_fit_are_used_unchanged() {
     let (auto, frames) = run(&app, &measurement, &json!("auto")).await;
     assert!(auto["registered"]["applied"] == false && !has_moved_masks(&auto), "{auto:#}");
     assert!(frames == expected, "the frames differ");
+}
+
+/// A stated shift can put the masks where the measurement has no light.
+#[tokio::test]
+async fn masks_that_are_moved_off_the_light_are_reported() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    // Masks at the upper border, masks of 4 rows, and masks that cover the picture.
+    let cases: [([usize; 3], fn(usize) -> bool, bool); 3] = [
+        ([4, 64, 64], |row| row < 3, true),
+        ([4, 4, 200], |_| true, true),
+        ([4, 64, 64], |_| true, false),
+    ];
+    for (shape, is_open, is_lost) in cases {
+        let [frames, height, width] = shape;
+        let mask = |k: usize, row: usize, column: usize| {
+            if is_open(row) { SCENE.mask(k, row, column) } else { 0.0 }
+        };
+        let masks = npy(
+            &shape,
+            (0..frames * height * width)
+                .map(|at| mask(at / width / height, at / width % height, at % width)),
+        );
+        let snapshot = npy(
+            &shape[1..],
+            (0..height * width)
+                .map(|at| (0..frames).map(|k| 0.5 * mask(k, at / width, at % width)).sum()),
+        );
+        let calibration = id(&app.calibrate(masks).await.expect(201));
+        let measurement = id(&app.measure(&calibration, snapshot).await.expect(201));
+        let job = app
+            .submit(&json!({
+                "measurement": measurement,
+                "algorithm": "gap-tv",
+                "registration": {"shift": [3.999, -3.999]},
+            }))
+            .await;
+        let ended = app.ended(&job).await;
+        let misplaced = finding(&ended, "misplaced_masks");
+        assert_eq!(misplaced.is_some(), is_lost, "{shape:?}: {ended:#}");
+        assert!(misplaced.is_none_or(|finding| finding["severity"] == "error"), "{ended:#}");
+        let moved = finding(&ended, "moved_masks").unwrap_or(&Value::Null).to_string();
+        assert!(moved.contains("states") && !moved.contains("corrected"), "{moved}");
+    }
 }

@@ -12,11 +12,13 @@ use strum::{Display, EnumString, VariantNames};
 use super::FindingCode;
 
 /// Largest number of bands.
-const MAX_BANDS: usize = 64;
+pub const MAX_BANDS: usize = 64;
 /// Largest offset in pixels.
 const MAX_OFFSET: f64 = 4096.0;
 /// Largest wavelength in nanometres: 1 mm, the end of the infrared.
 const MAX_WAVELENGTH: f64 = 1e6;
+/// Relative difference up to which two wavelengths are the same.
+const SAME_WAVELENGTH: f64 = 1e-11;
 
 /// The displacement of the bands of a spectral camera.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -106,6 +108,19 @@ impl Dispersion {
                 wavelengths[band]
             );
             return wrong(format!("/wavelengths/{band}"), detail);
+        }
+        // Wavelengths of a regular list differ from the numbers that are meant by rounding errors.
+        let is_same = |a: f64, b: f64| (a - b).abs() <= SAME_WAVELENGTH * a;
+        for (band, &length) in wavelengths.iter().enumerate() {
+            if let Some(other) =
+                wavelengths[..band].iter().position(|&other| is_same(length, other))
+            {
+                let detail = format!(
+                    "bands {other} and {band} (counted from 0) both have the wavelength {length} nm; state a different \
+                     one for each band"
+                );
+                return wrong(format!("/wavelengths/{band}"), detail);
+            }
         }
         Ok(())
     }
@@ -490,5 +505,6 @@ mod tests {
         };
         assert_eq!(lengths(&[500.0]), "/wavelengths");
         assert_eq!(lengths(&[500.0, 0.0, 510.0]), "/wavelengths/1");
+        assert_eq!(lengths(&[500.0, 510.0, 500.0]), "/wavelengths/2");
     }
 }

@@ -191,8 +191,11 @@ findings! {
         "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
          finding stays, record dark frames and name them as `dark`";
     MovedMasks: [Job], [Warning],
-        "the masks have moved since the calibration; the job has corrected them",
+        "the job uses masks that are displaced from their calibrated position",
         "calibrate again once the optics are stable";
+    MisplacedMasks: [Job], [Error],
+        "the moved masks explain no light in a large part of the picture",
+        "check the stated `shift` of the `registration`: pixels down, then pixels to the right; or use `registration` auto";
     TurnedMasks: [Measurement], [Error],
         "the masks fit when they are flipped or their rows and columns exchanged",
         "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \

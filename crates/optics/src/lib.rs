@@ -32,7 +32,7 @@ pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
 pub use calibration_check::{CaptureFigures, PatternFigures, judge_captures, judge_masks};
 pub use camera::{Camera, illumination};
 pub use defects::{Defects, judge_defects};
-pub use dispersion::{Dispersion, DispersionAxis, DispersionError, MaskExtent};
+pub use dispersion::{Dispersion, DispersionAxis, DispersionError, MAX_BANDS, MaskExtent};
 pub use displacement::{Displacement, displacement};
 pub use finding::{Entry, Finding, FindingCode, Severity, Subject};
 pub use geometry::Geometry;

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use rustix::fs::FallocateFlags;
+use rustix::io::Errno;
 
 use super::database_file::DatabaseFiles;
 use super::error::{Result, StoreError};
@@ -226,9 +227,11 @@ impl DataDir {
     }
 
     /// Bytes that are free on the disk of this folder, and its size.
+    /// Errors: [`StoreError::DatabaseGone`] if the folder is not at its place.
     pub fn disk(&self) -> Result<(u64, u64)> {
-        let stat = rustix::fs::statvfs(&*self.root).map_err(|error| {
-            StoreError::io("ask for the free space of", &self.root)(error.into())
+        let stat = rustix::fs::statvfs(&*self.root).map_err(|error| match error {
+            Errno::NOENT => StoreError::DatabaseGone(self.database()),
+            error => StoreError::io("ask for the free space of", &self.root)(error.into()),
         })?;
         Ok((stat.f_bavail * stat.f_frsize, stat.f_blocks * stat.f_frsize))
     }

@@ -96,10 +96,14 @@ impl Store {
         .await
     }
 
-    /// Marks a file as damaged, unless its record was deleted, and returns the error for it.
+    /// Marks a file as damaged, unless its record was deleted, and returns the error for it. Without the data folder no file
+    /// can be judged.
     async fn damaged(&self, record: &Record) -> StoreError {
         let name = record.name(self.dir());
         if let Err(error) = self.mark(record).await {
+            if matches!(error, StoreError::DatabaseGone(_)) {
+                return error;
+            }
             tracing::error!(file = name, %error, "that a file is damaged can't be noted");
         }
         match &record.place {

@@ -68,7 +68,7 @@ pub(super) struct Ledger {
 
 impl Ledger {
     /// Opens or creates the ledger of a folder.
-    /// Errors: another process uses it; a line can't be read.
+    /// Errors: another process uses it; a line is damaged.
     pub(super) fn open(path: PathBuf) -> Result<Self> {
         let failed = |error: std::io::Error| CliError::file("open", &path, &error);
         let mut options = OpenOptions::new();
@@ -77,17 +77,22 @@ impl Ledger {
             let text = "another watch-folder watches this folder";
             CliError::Input(format!("{}: {text} ({error})", path.display()))
         })?;
-        let text = fs::read_to_string(&path).map_err(failed)?;
+        let bytes = fs::read(&path).map_err(failed)?;
         // The step after an incomplete last line was not started.
-        let complete = text.rfind('\n').map_or(0, |end| end + 1);
-        file.set_len(complete as u64).map_err(failed)?;
+        let complete = bytes.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
         let mut entries = HashMap::new();
-        for (number, line) in text[..complete].lines().enumerate() {
-            let entry: Entry = serde_json::from_str(line).map_err(|error| {
-                CliError::Input(format!("{}, line {}: {error}", path.display(), number + 1))
+        for (number, line) in bytes[..complete].split_inclusive(|byte| *byte == b'\n').enumerate() {
+            let entry: Entry = serde_json::from_slice(line).map_err(|error| {
+                CliError::Input(format!(
+                    "{}, line {}: {error}. The file is damaged, or another program has changed it: remove this line, or \
+                     move the file away and submit all files of the folder again",
+                    path.display(),
+                    number + 1
+                ))
             })?;
             entries.insert(entry.shot.clone(), entry);
         }
+        file.set_len(complete as u64).map_err(failed)?;
         Ok(Self { path, file, entries })
     }
 
@@ -155,8 +160,13 @@ mod tests {
         ledger.record(entry("b", Stage::Failed { reason: "r".into() })).unwrap();
         drop(ledger);
         assert!(Ledger::open(path.clone()).unwrap().open_entries().is_empty());
-        fs::write(&path, "nonsense\n").unwrap();
-        let error = Ledger::open(path).err().unwrap().to_string();
-        assert!(error.contains("line 1"), "{error}");
+        for damaged in [&b"nonsense\n"[..], b"{\"name\": \"\xff\"}\n"] {
+            fs::write(&path, damaged).unwrap();
+            let error = Ledger::open(path.clone()).err().unwrap().to_string();
+            assert!(error.contains("line 1") && error.contains("remove this line"), "{error}");
+            assert_eq!(fs::read(&path).unwrap(), damaged);
+        }
+        fs::write(&path, b"torn \xff").unwrap();
+        assert!(Ledger::open(path).unwrap().open_entries().is_empty());
     }
 }

@@ -10,6 +10,7 @@
 mod ledger;
 
 use std::collections::HashMap;
+use std::ffi::{OsStr, OsString};
 use std::fs::{self, File};
 use std::io::Write;
 use std::os::unix::fs::MetadataExt;
@@ -43,10 +44,11 @@ const POLL: Duration = Duration::from_millis(500);
 ///
 /// A file is submitted when it stops growing. The results are written to NAME.result in the same folder, with a
 /// REPORT.txt; if the job fails, NAME.failed.txt has the reason. The command may be stopped and started at any
-/// time. With --once it ends with 1 if a job failed, and with 3 if the checks found errors in a file.
+/// time. With --once it ends with 1 if a job failed or a file was skipped, and with 3 if the checks found errors in a file.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// The folder. Subfolders, links and hidden files are ignored.
+    /// The folder. Subfolders and hidden files are ignored. Links, empty files and names that are not UTF-8 are skipped and
+    /// reported.
     folder: PathBuf,
     #[command(flatten)]
     service: ServiceArguments,
@@ -90,11 +92,17 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             ledger,
             growing: HashMap::new(),
             failed: 0,
+            skipped: HashMap::new(),
             results: Vec::new(),
         };
         watch.run().await?;
         if watch.failed > 0 {
             let text = format!("{} files have failed; see their .failed.txt", watch.failed);
+            return Err(CliError::Failure(text));
+        }
+        if !watch.skipped.is_empty() {
+            let text =
+                format!("{} files were skipped; the output has the reasons", watch.skipped.len());
             return Err(CliError::Failure(text));
         }
         let results = watch.results.iter();
@@ -116,6 +124,8 @@ struct Watch<'a> {
     growing: HashMap<Shot, Instant>,
     /// Files that have failed since the start.
     failed: usize,
+    /// Names of files that are not submitted, with the reasons.
+    skipped: HashMap<OsString, &'static str>,
     /// Findings and assessments of the jobs that have ended since the start.
     results: Vec<(Vec<Finding>, Option<Assessment>)>,
 }
@@ -131,7 +141,9 @@ impl Watch<'_> {
         };
         loop {
             let settled = self.scan()?;
-            let is_quiet = settled.is_empty() && self.growing.is_empty();
+            // An empty file may still be filled, but the end does not wait for it.
+            let is_skipped = |shot: &Shot| self.skipped.contains_key(OsStr::new(&shot.name));
+            let is_quiet = settled.is_empty() && self.growing.keys().all(is_skipped);
             for shot in settled {
                 self.take(shot, &recipe)?;
             }
@@ -149,20 +161,37 @@ impl Watch<'_> {
     fn scan(&mut self) -> Result<Vec<Shot>> {
         let unreadable = |error: std::io::Error| CliError::file("read", &self.folder, &error);
         let (now, mut growing, mut settled) = (Instant::now(), HashMap::new(), Vec::new());
+        let mut skipped = HashMap::new();
         for entry in fs::read_dir(&self.folder).map_err(unreadable)? {
             let path = entry.map_err(unreadable)?.path();
-            let Some(shot) = shot(&path) else { continue };
-            if self.ledger.has(&shot) || self.excluded.contains(&path) {
+            if self.excluded.contains(&path) {
                 continue;
             }
+            let shot = match look_at(&path) {
+                None => continue,
+                Some(Ok(shot)) if self.ledger.has(&shot) => continue,
+                Some(Ok(shot)) => shot,
+                Some(Err(reason)) => {
+                    skipped.extend(path.file_name().map(|name| (name.to_owned(), reason)));
+                    continue;
+                }
+            };
             let since = self.growing.get(&shot).copied().unwrap_or(now);
-            if now - since >= self.settle && shot.size > 0 {
-                settled.push(shot);
+            if now - since < self.settle {
+                growing.insert(shot, since);
             } else if shot.size > 0 {
+                settled.push(shot);
+            } else {
+                skipped.insert(shot.name.clone().into(), EMPTY);
                 growing.insert(shot, since);
             }
         }
-        self.growing = growing;
+        for (name, reason) in &skipped {
+            if !self.skipped.contains_key(name) {
+                self.report_skipped(&name.to_string_lossy(), reason)?;
+            }
+        }
+        (self.growing, self.skipped) = (growing, skipped);
         settled.sort_by(|a, b| (a.time, &a.name).cmp(&(b.time, &b.name)));
         Ok(settled)
     }
@@ -177,6 +206,15 @@ impl Watch<'_> {
         let results = results.unwrap_or_else(|| shot.name.clone());
         let key = Uuid::now_v7().to_string();
         self.record(Entry { shot, key, recipe: recipe.clone(), results, stage: Stage::Taken })
+    }
+
+    /// Prints once why a file is not submitted.
+    fn report_skipped(&self, name: &str, reason: &str) -> Result<()> {
+        if self.arguments.json {
+            let step = json!({"state": "skipped", "reason": reason});
+            return print_line(json!({"file": name, "step": step}));
+        }
+        print_line(format!("{name} is skipped: {reason}"))
     }
 
     /// True if no file and no entry uses the names of these results.
@@ -378,12 +416,36 @@ fn failure_file(name: &str) -> String {
     format!("{name}.failed.txt")
 }
 
+const EMPTY: &str = "the file is empty; it is submitted once it has content";
+
+/// The state of a file that may contain snapshots, or the reason why it is never submitted. `None` for folders, hidden files
+/// and files with other endings.
+fn look_at(path: &Path) -> Option<Result<Shot, &'static str>> {
+    let name = path.file_name()?;
+    let ending = path.extension()?.to_str()?.to_ascii_lowercase();
+    if name.as_encoded_bytes().starts_with(b".") || !ENDINGS.contains(&&*ending) {
+        return None;
+    }
+    let meta = path.symlink_metadata().ok()?;
+    if meta.is_dir() {
+        return None;
+    }
+    if meta.is_symlink() {
+        return Some(Err(
+            "it is a symbolic link; put the file in the folder, or a hard link to it",
+        ));
+    }
+    if !meta.is_file() {
+        return Some(Err("it is no regular file"));
+    }
+    let Some(name) = name.to_str() else {
+        return Some(Err("the name is not UTF-8; rename the file"));
+    };
+    let time = (meta.mtime(), meta.mtime_nsec());
+    Some(Ok(Shot { name: name.to_owned(), size: meta.len(), time }))
+}
+
 /// The state of a regular file that may contain snapshots. `None` for all other paths.
 fn shot(path: &Path) -> Option<Shot> {
-    let name = path.file_name()?.to_str().filter(|name| !name.starts_with('.'))?;
-    let ending = path.extension()?.to_str()?.to_ascii_lowercase();
-    let meta = path.symlink_metadata().ok().filter(|meta| meta.is_file())?;
-    let time = (meta.mtime(), meta.mtime_nsec());
-    let shot = Shot { name: name.to_owned(), size: meta.len(), time };
-    ENDINGS.contains(&&*ending).then_some(shot)
+    look_at(path)?.ok()
 }

@@ -10,6 +10,9 @@ use reconstruction::registration::{REACH, Registration};
 /// Reason where an estimate is not reliable.
 const NOT_CONVERGED: &str = "no shift by at most 4 pixels makes the masks explain the measurement well enough, so they were not moved";
 
+/// Share of the light without a mask from which moved masks are reported as misplaced.
+const MISPLACED: f64 = 0.25;
+
 /// Correction of masks that have moved since their calibration.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -63,6 +66,9 @@ pub struct Registered {
     pub applied: bool,
     /// Why nothing was estimated, or why the estimate is unreliable; null otherwise.
     pub reason: Option<String>,
+    /// Share of the first snapshot's light at pixels where the moved masks are all dark or unknown; null if the masks are not
+    /// moved.
+    pub lost_light: Option<f64>,
 }
 
 impl Registered {
@@ -81,6 +87,7 @@ impl Registered {
             error_after: None,
             applied: false,
             reason: Some(reason.to_owned()),
+            lost_light: None,
         }
     }
 
@@ -102,9 +109,9 @@ impl Registered {
         }
     }
 
-    /// The finding on masks that have moved.
-    pub fn finding(&self) -> Option<Finding> {
-        let [rows, columns] = self.applied_shift()?;
+    /// The findings on masks that the job has moved.
+    pub fn findings(&self) -> Vec<Finding> {
+        let Some([rows, columns]) = self.applied_shift() else { return Vec::new() };
         let detail = match (self.error_before, self.error_after) {
             (Some(before), Some(after)) => format!(
                 "the masks have moved by ({rows:.2}, {columns:.2}) pixels (rows, columns) since the calibration; the \
@@ -113,10 +120,19 @@ impl Registered {
                 100.0 * after.sqrt()
             ),
             _ => format!(
-                "the masks were moved by ({rows}, {columns}) pixels (rows, columns), as stated"
+                "the job has moved the masks by ({rows}, {columns}) pixels (rows, columns), as its request states"
             ),
         };
-        Some(Finding::new(FindingCode::MovedMasks, detail))
+        let mut findings = vec![Finding::new(FindingCode::MovedMasks, detail)];
+        if let Some(lost) = self.lost_light.filter(|lost| *lost > MISPLACED) {
+            let detail = format!(
+                "{:.0} % of the light of the first snapshot is at pixels where the masks are dark after they moved by \
+                 ({rows}, {columns}) pixels (rows, columns); the frames do not explain this light",
+                100.0 * lost
+            );
+            findings.push(Finding::new(FindingCode::MisplacedMasks, detail));
+        }
+        findings
     }
 }
 
@@ -131,6 +147,7 @@ impl From<Registration> for Registered {
             error_after: Some(error_after),
             applied,
             reason: (!converged).then(|| NOT_CONVERGED.to_owned()),
+            lost_light: None,
         }
     }
 }

@@ -56,7 +56,10 @@ text_schema!(SnapshotSelection, "Selection", {
 });
 
 #[derive(Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "snapshots must be \"all\", one index, or [first, last] with both ends included"
+)]
 enum SelectionJson {
     Word(String),
     One(u32),

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use derive_more::Display;
+use jiff::fmt::temporal::Pieces;
 use serde::Serialize;
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 
@@ -93,18 +94,18 @@ impl FromStr for Label {
         let length = text.chars().count();
         if text.trim().is_empty() {
             return Err(InvalidText(
-                "the name is blank: omit it, or use at least one visible character".into(),
+                "the text is blank: omit it, or use at least one visible character".into(),
             ));
         }
         if length > Self::MAX_CHARS {
             return Err(InvalidText(format!(
-                "the name has {length} characters; at most {} are accepted",
+                "the text has {length} characters; at most {} are accepted",
                 Self::MAX_CHARS
             )));
         }
         match text.chars().position(char::is_control) {
             Some(position) => Err(InvalidText(format!(
-                "the name contains a control character at position {position}: use printable characters only"
+                "the text contains a control character at position {position}: use printable characters only"
             ))),
             None => Ok(Self(text.to_owned())),
         }
@@ -199,9 +200,15 @@ impl FromStr for Timestamp {
     fn from_str(text: &str) -> Result<Self, InvalidText> {
         let time: Result<jiff::Timestamp, _> = text.parse();
         time.map(|time| Self(time.as_millisecond())).map_err(|_| {
+            let shown: String = text.chars().take(80).collect();
+            if Pieces::parse(text).is_ok_and(|pieces| pieces.time().is_some()) {
+                let (first, last) = (jiff::Timestamp::MIN, jiff::Timestamp::MAX);
+                return InvalidText(format!(
+                    "{shown:?} is not from {first:.0} to {last:.0}, or has no offset such as Z"
+                ));
+            }
             InvalidText(format!(
-                "{:?} is not a time: RFC 3339 is expected, such as 2026-11-21T10:39:01Z",
-                text.chars().take(80).collect::<String>()
+                "{shown:?} is not a time: RFC 3339 is expected, such as 2026-11-21T10:39:01Z"
             ))
         })
     }

@@ -44,6 +44,11 @@ impl Webhook {
         Ok(host.strip_suffix(":80").map(str::to_owned).unwrap_or(host))
     }
 
+    /// Scheme and host. Path and query may hold a secret of the receiver.
+    pub fn origin(&self) -> String {
+        format!("{}://{}", self.0.scheme(), self.place())
+    }
+
     /// The host, with the port unless it is the default one of the scheme.
     pub fn place(&self) -> String {
         let host = self.0.host_str().unwrap_or_default();

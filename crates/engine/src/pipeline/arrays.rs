@@ -97,6 +97,17 @@ pub fn mask_window(
 ) -> Result<Array3<f32>, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
     let Some(shift) = shift else { return window(masks, 0..frames, place) };
+    moved_window((height, width), place, shift, |wide| window(masks, 0..frames, wide))
+}
+
+/// A window of masks of `height` x `width` pixels after they moved by `shift`. `read` gets the window of the calibrated masks
+/// on which it depends.
+pub(super) fn moved_window<E>(
+    (height, width): (usize, usize),
+    place: &Window,
+    shift: [f64; 2],
+    read: impl FnOnce(&Window) -> Result<Array3<f32>, E>,
+) -> Result<Array3<f32>, E> {
     let around = |range: &Range<usize>, length: usize| {
         range.start.saturating_sub(MARGIN)..length.min(range.end + MARGIN)
     };
@@ -104,8 +115,7 @@ pub fn mask_window(
     let within = |range: &Range<usize>, start: usize| range.start - start..range.end - start;
     let inner = (within(&place.rows, rows.start), within(&place.columns, columns.start));
     let wide = Window { rows, columns, step: 1 };
-    let moved =
-        Interpolated::new(window(masks, 0..frames, &wide)?.view()).window(shift, inner.0, inner.1);
+    let moved = Interpolated::new(read(&wide)?.view()).window(shift, inner.0, inner.1);
     let step = place.step.cast_signed();
     Ok(moved.slice(s![.., ..;step, ..;step]).to_owned())
 }

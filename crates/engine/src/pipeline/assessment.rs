@@ -210,10 +210,10 @@ pub fn expected(
 fn is_in_doubt(findings: &[Finding]) -> bool {
     use FindingCode::{
         BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
-        InvertedMasks, MaskScale, MissingPattern, Mosaic, Negative, NegativeOffset, NoDark,
-        ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
+        InvertedMasks, MaskScale, MisplacedMasks, MissingPattern, Mosaic, Negative, NegativeOffset,
+        NoDark, ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
     };
-    const DOUBTS: [FindingCode; 16] = [
+    const DOUBTS: [FindingCode; 17] = [
         BadCalibration,
         BinaryMeasurement,
         DriftedMasks,
@@ -221,6 +221,7 @@ fn is_in_doubt(findings: &[Finding]) -> bool {
         ForeignMasks,
         InvertedMasks,
         MaskScale,
+        MisplacedMasks,
         MissingPattern,
         Mosaic,
         Negative,

@@ -1,5 +1,6 @@
 //! Movies of the frames of one snapshot, or of several consecutive ones.
 
+use std::fmt;
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
@@ -27,10 +28,22 @@ pub struct DisplayWindow {
 
 /// The values of black and white do not span a range.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-#[error("black is {black} and white is {white}; black must be below white")]
 pub struct EmptyWindow {
     black: f32,
     white: f32,
+}
+
+impl fmt::Display for EmptyWindow {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // `Debug` has an exponent where `Display` has 39 digits.
+        let Self { black, white } = self;
+        write!(f, "black is {black:?} and white is {white:?}; ")?;
+        if black < white {
+            write!(f, "both and their difference must be at most {:?}", f32::MAX)
+        } else {
+            f.write_str("black must be below white")
+        }
+    }
 }
 
 impl DisplayWindow {

@@ -1,8 +1,8 @@
 //! Registration of the masks of a job, which is decided once before its other tasks.
 
-use ndarray::{Array3, ArrayView2, ArrayView3, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
-use super::arrays::{Arrays, mask_window};
+use super::arrays::{Arrays, mask_window, moved_window};
 use super::error::Result;
 use super::progress::Monitor;
 use crate::job::{Registered, RegistrationRequest, SnapshotRange, TaskStage};
@@ -15,29 +15,74 @@ const SMALL: &str = "the picture is too small to register the masks";
 const DARK: &str = "the piece on which masks are registered has no light or no measured pixels, or its reconstruction \
                     diverges";
 
-/// Registers masks in memory: all of them \[B,H,W\], and one snapshot \[H,W\] on the scale on which the scene is on
-/// \[0,1\]. `None` if it is off.
+/// Side in pixels of the windows in which the light of moved masks is summed.
+const WINDOW: usize = 128;
+
+/// Registers the masks of a picture \[H,W\] by one snapshot `y` on the scale on which the scene is on \[0,1\]. `light` gives
+/// the sum of the masks, and `masks` a window of them. `None` if it is off.
 ///
-/// Errors: those of [`registration::register`].
+/// Errors: those of [`registration::register`] and of reading.
 pub fn register(
     request: RegistrationRequest,
     is_coloured: bool,
-    light: ArrayView2<'_, f32>,
+    light: impl FnOnce() -> Result<Array2<f32>>,
     y: ArrayView2<'_, f32>,
-    piece: impl FnOnce(&Window) -> Result<Array3<f32>>,
+    masks: impl Fn(&Window) -> Result<Array3<f32>>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Option<Registered>> {
-    if let Some(outcome) = without_estimate(request, is_coloured) {
-        return Ok(outcome);
-    }
-    let Some((rows, columns)) = registration::choose(light, y) else {
-        return Ok(Some(Registered::skipped(SMALL)));
+    let mut outcome = match without_estimate(request, is_coloured) {
+        Some(outcome) => outcome,
+        None => Some(estimate(light()?.view(), y, &masks, proceed)?),
     };
-    let place = Window { rows: rows.clone(), columns: columns.clone(), step: 1 };
-    let masks = piece(&place)?;
+    if let Some(registered) = &mut outcome
+        && let Some(shift) = registered.applied_shift()
+    {
+        registered.lost_light = Some(lost_light(y, shift, masks)?);
+    }
+    Ok(outcome)
+}
+
+fn estimate(
+    light: ArrayView2<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    masks: impl Fn(&Window) -> Result<Array3<f32>>,
+    proceed: &mut dyn FnMut(f64) -> bool,
+) -> Result<Registered> {
+    let Some((rows, columns)) = registration::choose(light, y) else {
+        return Ok(Registered::skipped(SMALL));
+    };
+    let piece = masks(&Window { rows: rows.clone(), columns: columns.clone(), step: 1 })?;
     let y = y.slice(s![rows, columns]);
-    let found = registration::register(masks.view(), y, proceed)?;
-    Ok(Some(found.map_or_else(|| Registered::skipped(DARK), Registered::from)))
+    let found = registration::register(piece.view(), y, proceed)?;
+    Ok(found.map_or_else(|| Registered::skipped(DARK), Registered::from))
+}
+
+/// Share of the light of `y` \[H,W\] at pixels where the masks, moved by `shift`, are all dark or unknown.
+fn lost_light(
+    y: ArrayView2<'_, f32>,
+    shift: [f64; 2],
+    masks: impl Fn(&Window) -> Result<Array3<f32>>,
+) -> Result<f64> {
+    let (height, width) = y.dim();
+    let (mut lost, mut all) = (0.0, 0.0);
+    for row in (0..height).step_by(WINDOW) {
+        for column in (0..width).step_by(WINDOW) {
+            let rows = row..height.min(row + WINDOW);
+            let columns = column..width.min(column + WINDOW);
+            let place = Window { rows: rows.clone(), columns: columns.clone(), step: 1 };
+            let moved = moved_window((height, width), &place, shift, &masks)?;
+            for (pixel, &y) in moved.lanes(Axis(0)).into_iter().zip(y.slice(s![rows, columns])) {
+                // `max` also replaces NaN, which were not measured.
+                let light = f64::from(y.max(0.0));
+                all += light;
+                // NaN are unknown masks.
+                if !pixel.iter().any(|mask| *mask > 0.0) {
+                    lost += light;
+                }
+            }
+        }
+    }
+    Ok(if all > 0.0 { lost / all } else { 0.0 })
 }
 
 /// The outcome of a request that needs no estimate.
@@ -58,15 +103,15 @@ pub fn register_stored(
     white: f32,
     monitor: &Monitor,
 ) -> Result<Option<Registered>> {
-    // Without an estimate nothing is read.
-    if let Some(outcome) = without_estimate(request, is_coloured) {
+    // Nothing is read if no masks are moved.
+    if let Some(outcome) = without_estimate(request, is_coloured)
+        && outcome.as_ref().is_none_or(|registered| !registered.applied)
+    {
         return Ok(outcome);
     }
-    let first = snapshots.first;
-    let y = arrays.snapshot(first)? / white;
-    let light = arrays.light(monitor)?;
-    let piece = |place: &Window| Ok(mask_window(&arrays.masks()?, place, None)?);
-    register(request, is_coloured, light.view(), y.view(), piece, &mut |share| {
+    let y = arrays.snapshot(snapshots.first)? / white;
+    let masks = |place: &Window| Ok(mask_window(&arrays.masks()?, place, None)?);
+    register(request, is_coloured, || arrays.light(monitor), y.view(), masks, &mut |share| {
         monitor.reach(TaskStage::Tv, share);
         !monitor.stopped()
     })

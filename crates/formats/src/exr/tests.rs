@@ -46,15 +46,16 @@ fn frames_are_stored_bit_for_bit_with_their_attributes() {
 
 #[test]
 fn channels_of_bands_have_the_names_of_their_wavelengths() {
-    let stack = ramp((2, 5, 7), 1 << 20);
+    let stack = ramp((4, 5, 7), 1 << 20);
     let path = tempfile::NamedTempFile::new().unwrap();
     let part = |wavelength| Attributes { wavelength_nm: Some(wavelength), ..attributes(0) };
-    write_stack(path.path(), (5, 7), Channels::Grey, &[part(453.25), part(700.0)], |k| {
+    let parts = [453.25, 700.000_000_000_000_1, 500.0, 500.000_000_1].map(part);
+    write_stack(path.path(), (5, 7), Channels::Grey, &parts, |k| {
         Ok::<_, FormatError>(stack.index_axis(ndarray::Axis(0), k).to_owned())
     })
     .unwrap();
     let bytes = std::fs::read(path.path()).unwrap();
-    for name in [&b"S0.453,25nm\0"[..], b"S0.700nm\0"] {
+    for name in [&b"S0.453,25nm\0"[..], b"S0.700nm\0", b"S0.500nm\0", b"S0.500,0000001nm\0"] {
         assert!(bytes.windows(name.len()).any(|window| window == name));
     }
     let (_, back) = read_stack(path.path(), &Limits::default()).unwrap();

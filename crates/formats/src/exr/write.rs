@@ -98,10 +98,12 @@ fn part_name(index: usize) -> String {
 }
 
 /// Name of the channel of a wavelength in the layout of spectral EXR images (Fichet, Pacanowski and Wilkie 2021), with a
-/// decimal comma because dots separate layers.
+/// decimal comma because dots separate layers. Rounding errors are left out, but bands that differ have different names.
 fn spectral_name(wavelength_nm: f64) -> String {
     let rounded = (wavelength_nm * 1000.0).round() / 1000.0;
-    format!("S0.{}nm", rounded.to_string().replace('.', ","))
+    let is_exact = (rounded - wavelength_nm).abs() <= 1e-12 * wavelength_nm;
+    let shown = if is_exact { rounded } else { wavelength_nm };
+    format!("S0.{}nm", shown.to_string().replace('.', ","))
 }
 
 fn header(

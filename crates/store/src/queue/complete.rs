@@ -246,7 +246,7 @@ impl Store {
     }
 }
 
-/// Puts the registration of the masks into the job, and its finding among the warnings.
+/// Puts the registration of the masks into the job, and its findings among the warnings.
 async fn register(connection: &mut SqliteConnection, job: JobId, record: &Value) -> Result<()> {
     let Some(registration) = record.get("registration") else { return Ok(()) };
     let corrupt = |_| StoreError::Corrupt { column: "record", value: registration.to_string() };
@@ -259,22 +259,25 @@ async fn register(connection: &mut SqliteConnection, job: JobId, record: &Value)
     )
     .execute(&mut *connection)
     .await?;
-    if let Some(finding) = registered.finding() {
-        // An earlier attempt may have added it.
-        let superseded = registered.superseded().iter().map(|code| code.as_str());
-        let replaced: Vec<_> = superseded.chain([finding.code.as_str()]).collect();
-        sql!(
-            "UPDATE jobs SET spec = json_set(spec, '$.warnings', (
-                 SELECT json_group_array(json(value)) FROM (
-                     SELECT value FROM json_each(jobs.spec, '$.warnings')
-                     WHERE value ->> 'code' NOT IN (SELECT value FROM json_each(?1))
-                     UNION ALL SELECT ?2 AS value)))
-             WHERE id = ?3",
-            [Json(&replaced), Json(&finding), job]
-        )
-        .execute(&mut *connection)
-        .await?;
+    let findings = registered.findings();
+    if findings.is_empty() {
+        return Ok(());
     }
+    // An earlier attempt may have added them.
+    let superseded = registered.superseded().iter().map(|code| code.as_str());
+    let replaced: Vec<_> =
+        superseded.chain(findings.iter().map(|finding| finding.code.as_str())).collect();
+    sql!(
+        "UPDATE jobs SET spec = json_set(spec, '$.warnings', (
+             SELECT json_group_array(json(value)) FROM (
+                 SELECT value FROM json_each(jobs.spec, '$.warnings')
+                 WHERE value ->> 'code' NOT IN (SELECT value FROM json_each(?1))
+                 UNION ALL SELECT value FROM json_each(?2))))
+         WHERE id = ?3",
+        [Json(&replaced), Json(&findings), job]
+    )
+    .execute(&mut *connection)
+    .await?;
     Ok(())
 }
 
