@@ -293,7 +293,7 @@ function fits(item) {
   const wrong = findings(item.warnings);
   const severe = item.warnings.some(({ severity }) => severity === "error");
   return [
-    h("p", { class: severe ? "bad" : wrong ? "warn" : "good" }, severe ? "The measurement is accepted, but its frames will be wrong:" : wrong ? "The measurement is accepted with warnings:" : "The measurement fits the calibration."),
+    h("p", { class: severe ? "bad" : wrong ? "warn" : "good" }, severe ? "The measurement is accepted, but the checks found errors:" : wrong ? "The measurement is accepted with warnings:" : "The measurement fits the calibration."),
     wrong,
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
