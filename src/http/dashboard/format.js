@@ -11,9 +11,10 @@ export function expectedRange(assessment) {
   return high >= 40 ? `${low.toFixed(1)} dB or more` : `${low.toFixed(1)} to ${high.toFixed(1)} dB`;
 }
 
-/** An estimated duration without digits that are uncertain: 75 -> "2 min". */
+/** An estimated duration without digits that are uncertain: 75 -> "2 min", 8000 -> "3 h". */
 export function roughly(seconds) {
-  return duration(seconds > 60 ? 60 * Math.ceil(seconds / 60) : Math.max(1, seconds));
+  const digit = seconds > 7200 ? 3600 : seconds > 60 ? 60 : 1;
+  return duration(digit * Math.max(1, Math.ceil(seconds / digit)));
 }
 
 /** 75 -> "1 min 15 s". */
