@@ -38,8 +38,12 @@ function tile(item, signal) {
 /** Image, name, size and grade of a calibration. */
 export function glance(item, signal) {
   const ready = item.state === "ready";
+  const blank = () => h("span", { class: "blank" });
+  const image = ready && h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 });
+  // The stored masks may be damaged.
+  if (image) image.addEventListener("error", () => image.replaceWith(blank()));
   return [
-    ready ? h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
+    image || blank(),
     h("span", { class: "about" }, h("b", null, nameOf(item)),
       ready ? h("span", { class: "muted" }, `${item.frames} ${item.frames === 1 ? "mask" : "masks"} of ${item.height} × ${item.width}${item.dispersion ? ", spectral" : ""}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
       ready && grade(item.id, signal), h("time", { class: "muted", datetime: item.created_at, title: momentInFull(item.created_at) }, moment(item.created_at))),
