@@ -80,7 +80,7 @@ function errors({ items }) {
 
 function workers(found) {
   const title = `Workers: ${found.workers.length} of ${found.workers_wanted} ready`;
-  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait. Start the service with ", h("code", null, "--workers 1"), " or more, or connect workers of other machines."));
+  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait. Start the service with ", h("code", { class: "together" }, "--workers 1"), " or more, or connect workers of other machines."));
   const row = (worker) => h("tr", null,
     h("th", { scope: "row" }, short(worker.id)), h("td", { class: "minor" }, worker.pid), h("td", { class: "minor" }, worker.version), h("td", null, worker.device ?? ""),
     h("td", null, task(worker.task)),
