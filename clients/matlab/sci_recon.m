@@ -5,9 +5,12 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %   sequence of snapshots, waits for the job, and returns FRAMES [H,W,B], or [H,W,B,S], single. The measurement is the
 %   sum of the masked frames: its values reach B where all masks are open.
 %
+%   FRAMES = SCI_RECON(ID) returns the frames of an existing job, such as one that was submitted in the dashboard. It
+%   waits for a job that has not ended.
+%
 %   [FRAMES, JOB] = ... also returns the service's description of the job.
 %
-%   SCI_RECON(..., NAME, VALUE, ...):
+%   SCI_RECON(..., NAME, VALUE, ...). For an existing job, only 'url', 'token' and 'quiet' matter:
 %     'url'         address of the service   (default: environment SCI_RECON_URL, or http://127.0.0.1:8080)
 %     'token'       access token             (default: environment SCI_RECON_TOKEN)
 %     'algorithm'   'pnp-tv-fastdvdnet' (default), 'gap-tv', 'gap-tv3d', ...
@@ -26,6 +29,15 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %     masks = single(rand(256, 256, 8) > 0.5);
 %     frames = sci_recon(masks, sum(masks .* video, 3), 'url', 'http://server.lab:8080', 'algorithm', 'gap-tv');
 
+  if ischar(masks)
+    flags = varargin;
+    if nargin > 1
+      flags = [{measurement} varargin];
+    end
+    o = options(flags);
+    [frames, job] = collect(o, request(o, 'GET', ['/v1/jobs/' masks], []));
+    return
+  end
   o = options(varargin);
   if ndims(masks) > 3 || ndims(measurement) > 3
     error('sci_recon:size', 'masks are [H,W,B] and the measurement is [H,W] or [H,W,S]');
@@ -51,6 +63,11 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
   job = request(o, 'POST', '/v1/jobs', ...
                 given(struct('measurement', taken.id, 'algorithm', o.algorithm, 'schedule', o.schedule, ...
                              'label', o.label)));
+  [frames, job] = collect(o, job);
+end
+
+function [frames, job] = collect(o, job)
+  % Waits until a job has ended, and downloads its frames.
   shown = -1;
   delay = 0.2;
   while any(strcmp(job.state, {'queued', 'running', 'cancelling'}))
@@ -69,7 +86,7 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
   frames = [];
   for s = job.snapshots.first + (0:job.snapshots.count - 1)
     % Colour frames have one more axis.
-    frames = cat(4 + ~isempty(o.mosaic), frames, download(o, sprintf('/v1/jobs/%s/snapshots/%d', job.id, s)));
+    frames = cat(4 + ~isempty(job.shape.mosaic), frames, download(o, sprintf('/v1/jobs/%s/snapshots/%d', job.id, s)));
   end
 end
 

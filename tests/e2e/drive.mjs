@@ -199,6 +199,60 @@ export async function spectrum(page, checks, scene, bands) {
   await page.selectOption("#mode", "frame");
 }
 
+/** States a map of bad pixels and a known shift of the masks, and reconstructs with both; returns the job's identifier. */
+export async function stated(page, checks, scene, other) {
+  await page.click("#nav >> text=New job");
+  await page.check("input[value=masks]");
+  await page.click("summary:has-text('Map of bad pixels')");
+  const file = (name, buffer) => ({ name, mimeType: "application/octet-stream", buffer });
+  await page.setInputFiles("#bad-pixels", file("other.npy", other.dead()));
+  await drop(page, "label.drop:has(#masks)", "masks.npy", scene.masks);
+  await page.waitForSelector(".step:nth-child(1) .verdict .trouble:has-text('map of bad pixels')");
+  await page.setInputFiles("#bad-pixels", file("dead.npy", scene.dead()));
+  await page.waitForSelector("text=The calibration is accepted.");
+  await drop(page, "label.drop:has(#data)", "measurement.npy", scene.moved(2, -1));
+  await page.waitForSelector(".step:nth-child(2) .verdict:has-text('The measurement is accepted')");
+  checks.that(await page.isHidden("#shift-rows"), "the form asks for a shift only where one is known");
+  await page.selectOption("#registration", "stated");
+  await page.fill("#shift-rows", "2");
+  await page.fill("#shift-columns", "-1");
+  await page.selectOption("#algorithm", "gap-tv");
+  await page.waitForSelector(".estimate dd");
+  await checks.look(page, "submit-stated");
+  await page.click("button[type=submit]");
+  await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
+  await state(page, "succeeded");
+  const text = await (await page.waitForSelector("section[aria-label=Registration]:has-text('Moved as stated')")).textContent();
+  checks.that(text.includes("by 2 pixels downwards and 1 pixel to the left"), `the stated shift is in words: ${text}`);
+  return page.url().slice(-36);
+}
+
+/** Compares jobs of a spectral camera: with equal wavelengths the player names the band, with others each pane. */
+export async function bands(page, checks, service, scene, count) {
+  const reconstruct = async (first) => {
+    const [masks, data] = await Promise.all([scene.mask, scene.measurement].map((bytes) => service.call("POST", "/v1/blobs", bytes)));
+    const numbers = (start, step) => Array.from({ length: count }, (_, index) => start + step * index);
+    const dispersion = { axis: "column", mask: "scene", offsets: numbers(0, 2), wavelengths: numbers(first, 40) };
+    const calibration = await service.call("POST", "/v1/calibrations", { masks: masks.sha256, dispersion });
+    const measurement = await service.call("POST", "/v1/measurements", { calibration: calibration.id, data: data.sha256 });
+    const { id } = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: `from ${first} nm` });
+    await service.when(id, (job) => job.state === "succeeded");
+    return id;
+  };
+  const [one, same, other] = [await reconstruct(450), await reconstruct(450), await reconstruct(500)];
+  const titles = () => page.$$eval(".pane figcaption span:first-child", (all) => all.map((title) => title.textContent));
+  await page.goto(`${service.url}/#/compare/${one}/${same}`);
+  await page.waitForSelector(".player output:has-text('band 1 · 450 nm')");
+  await page.click("[aria-label='Next frame']");
+  await page.waitForSelector(".player output:has-text('band 2 · 490 nm')");
+  checks.that((await titles()).every((title) => title === "from 450 nm"), `the panes have the jobs' names: ${await titles()}`);
+  await page.goto(`${service.url}/#/compare/${one}/${other}`);
+  await page.waitForSelector(".player output:text-is('band 1')");
+  await checks.until(titles, ([left, right]) => left === "from 450 nm, band 1 · 450 nm" && right === "from 500 nm, band 1 · 500 nm", "each pane names its band");
+  checks.that((await page.textContent(".differs tr:has-text('Bands')")).includes("500 to 700 nm"), "the table has the wavelengths");
+  await checks.look(page, "compare-bands");
+}
+
 /** Shows the displacement that a job has found. */
 export async function moved(page, checks) {
   await page.waitForSelector(".quality:has-text('Expected PSNR: about')");
@@ -416,6 +470,10 @@ export async function compare(page, checks, labels, truth) {
   const groups = await page.$$eval(".figures tbody", (bodies) => bodies.map((body) => body.className));
   checks.that(groups[0] === "differs" && groups[1] === "same", `rows that differ come first: ${groups}`);
   await checks.look(page, "compare");
+  await page.setViewportSize({ width: 390, height: 844 });
+  const ends = await page.$$eval(".figures td", (cells) => cells.map((cell) => cell.getBoundingClientRect().right));
+  checks.that(Math.max(...ends) < 390, `a phone shows the figures of both jobs: ${Math.max(...ends)}`);
+  await page.setViewportSize({ width: 1400, height: 900 });
   const picture = () => page.$eval(".sight canvas", (canvas) => canvas.toDataURL());
   const windows = () => page.$$eval(".contrasts .window", (all) => all.map((one) => one.textContent));
   checks.that(new Set(await windows()).size === 1, `jobs of one scale share a contrast: ${await windows()}`);

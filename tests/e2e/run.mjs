@@ -8,7 +8,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, captures, colour, compare, decided, judged, manage, mended, moved, movie, network, sample, spectrum, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, bands, captures, colour, compare, decided, judged, manage, mended, moved, movie, network, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene, spectral } from "./scene.mjs";
@@ -58,6 +58,7 @@ async function everything() {
   await checks.step("movie in colour", () => movie(page, checks, [FRAMES, 192, 256]));
   await checks.step("mended", () => mended(page, checks, service));
   await checks.step("spectral", () => spectrum(page, checks, spectral(6, 64, 96, 2), 6));
+  await checks.step("bands", () => bands(page, checks, service, spectral(6, 64, 96, 2), 6));
   const drifting = scene(FRAMES, 128, 128, 3);
   const { calibration } = await service.take(drifting);
   const shifted = await service.call("POST", "/v1/blobs", drifting.moved(2, -1));
@@ -66,6 +67,9 @@ async function everything() {
   await service.when(registered.id, (job) => job.state === "succeeded");
   await page.goto(`${service.url}/#/jobs/${registered.id}`);
   await checks.step("moved", () => moved(page, checks));
+  const known = await checks.step("stated", () => stated(page, checks, drifting, small));
+  const { registration } = await service.call("GET", `/v1/jobs/${known}`);
+  checks.that(JSON.stringify(registration) === '{"shift":[2,-1]}', `the job has the stated shift: ${JSON.stringify(registration)}`);
   await checks.step("phone", () => phone(browser, checks, service.url, id));
   await checks.step("loading", () => loading(browser, checks, service.url));
   await checks.step("reference", () => reference(browser, checks, service.url));

@@ -88,6 +88,8 @@ export async function access(browser, checks, program, services) {
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("h1:has-text('Your role does not allow this')");
   await checks.look(page, "forbidden");
+  await page.goto(`${service.url}/#/nowhere`);
+  await page.waitForSelector("h1:has-text('Page not found')");
   await page.click("#who");
   await page.waitForSelector("h1:has-text('Lab optics')");
   await checks.look(page, "account");
@@ -95,6 +97,14 @@ export async function access(browser, checks, program, services) {
   await page.waitForSelector("h1:has-text('Sign in')");
   checks.that((await page.evaluate(() => document.cookie)) === "", "scripts see no cookie");
   await page.reload();
+  await page.fill("#token", service.token("read"));
+  await page.keyboard.press("Enter");
+  await page.waitForSelector("#who:has-text('optics · read')");
+  await page.goto(`${service.url}/#/new`);
+  await page.waitForSelector("h1:has-text('Your role does not allow this')");
+  await page.click("#who");
+  await page.click("#sign-out");
+  await page.waitForSelector("h1:has-text('Sign in')");
   await page.fill("#token", admin);
   await page.click("text=Sign in >> nth=1");
   await page.waitForSelector("#nav >> text=System >> visible=true");

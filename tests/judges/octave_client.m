@@ -16,6 +16,8 @@ for s = 1:2
   difference = norm(again(:) - measurement(:, :, s)(:)) / norm(measurement(:, :, s)(:));
   assert(difference < 0.05, 'snapshot %d does not fit its measurement: %g', s, difference);
 end
+[later, same] = sci_recon(job.id, 'quiet', true);
+assert(isequal(later, frames) && strcmp(same.id, job.id), 'the frames of an existing job differ');
 error_of = @(frames, truth) sqrt(mean((frames(:) - truth(:)) .^ 2));
 assert(error_of(frames(:, :, :, 1), video) < 0.08 && error_of(frames(:, :, :, 2), flipud(video)) < 0.08);
 refused = '';

@@ -27,7 +27,7 @@ export async function calibrations(root, _, signal) {
   more.addEventListener("click", load);
   const count = await load();
   root.append(h("div", { class: "row head" }, h("h1", null, "Calibrations"), h("span", { class: "grow" }), h("a", { class: "button primary writes", href: "#/new" }, "New calibration")));
-  root.append(count ? h("section", { "aria-label": "Calibrations" }, list, more) : h("p", { class: "note" }, "No calibrations yet. A ", h("a", { href: "#/new" }, "new job"), " starts with one."));
+  root.append(count ? h("section", { "aria-label": "Calibrations" }, list, more) : h("p", { class: "muted" }, "No calibrations yet. A calibration holds the masks of one setting of the camera. Upload masks, or captures of a white board, with a ", h("a", { href: "#/new" }, "new job"), "."));
 }
 
 /** A card with a mask, name and grade. */
@@ -38,10 +38,14 @@ function tile(item, signal) {
 /** Image, name, size and grade of a calibration. */
 export function glance(item, signal) {
   const ready = item.state === "ready";
+  const blank = () => h("span", { class: "blank" });
+  const image = ready && h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 });
+  // The stored masks may be damaged.
+  if (image) image.addEventListener("error", () => image.replaceWith(blank()));
   return [
-    ready ? h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
+    image || blank(),
     h("span", { class: "about" }, h("b", null, nameOf(item)),
-      ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}${item.dispersion ? ", spectral" : ""}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
+      ready ? h("span", { class: "muted" }, `${item.frames} ${item.frames === 1 ? "mask" : "masks"} of ${item.height} × ${item.width}${item.dispersion ? ", spectral" : ""}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
       ready && grade(item.id, signal), h("time", { class: "muted", datetime: item.created_at, title: momentInFull(item.created_at) }, moment(item.created_at))),
   ];
 }
@@ -110,7 +114,7 @@ function about(item) {
     ["Masks (compression ratio)", item.frames],
     ["Size", `${item.height} × ${item.width} (rows × columns)`],
     ["Sensor", item.mosaic ? `in colour, ${item.mosaic.toUpperCase()}` : "grey"],
-    item.dispersion && ["Dispersion", `one mask for ${item.dispersion.offsets.length} bands, displaced by up to ${figure(Math.max(...item.dispersion.offsets))} pixels along a ${item.dispersion.axis}`],
+    item.dispersion && ["Dispersion", `one mask for ${item.dispersion.offsets.length} bands, displaced by up to ${figure(Math.max(...item.dispersion.offsets))} pixels ${item.dispersion.axis === "column" ? "to the right" : "downwards"}`],
     ["Mean transmission", figure(item.mask_mean)],
     ["Dead pixels", `${item.dead_pixels} (${figure((100 * item.dead_pixels) / pixels, 2)} %)`],
     ["Values below 0, set to 0", item.clipped_negatives],

@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, explained, h, put, say } from "./dom.js";
-import { bytes, decibels, duration, expectedRange, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
+import { bytes, decibels, duration, expectedRange, figure, frameName, iterationsOf, nameOf, shapeOf, wavelengthsOf } from "./format.js";
 import { isAborted, get, send, upload } from "./api.js";
 import { networks, ran } from "./provenance.js";
 import { sampled } from "./values.js";
@@ -25,7 +25,7 @@ export async function compare(root, [path], signal) {
     root.append(group.element);
     await group.open();
   } else {
-    root.append(h("p", { class: "note" }, "The frames can be compared when all jobs have succeeded."));
+    root.append(h("p", { class: "muted" }, "The frames can be compared when all jobs have succeeded."));
   }
   const table = h("div");
   root.append(h("section", { class: "card", "aria-label": "Figures" }, h("h2", null, "Figures"), table, all && truth(jobs, manifests, table, signal)));
@@ -58,7 +58,7 @@ function truth(jobs, manifests, table, signal) {
   // True frames of one scene are meaningless for another.
   const truths = jobs.map((job) => job.truth ?? (job.measurement === first?.measurement ? first.truth : null));
   if (truths.every(Boolean)) measure(truths).catch(showError);
-  return h("div", { class: "row" }, h("label", { for: "truth", class: "button small filebutton writes" }, "Attach true frames", input), status);
+  return h("div", { class: "row below" }, h("label", { for: "truth", class: "button small filebutton writes" }, "Attach true frames", input), status);
 }
 
 async function manifest(job, signal) {
@@ -80,7 +80,10 @@ class Group {
     this.contrasts = jobs.map((job) => new Contrast(nameOf(job), (from) => this.adjust(from), nameOf(job)));
     this.match = h("input", { type: "checkbox", id: "match", onchange: () => this.rescale() });
     this.scales = h("span", { class: "muted" });
-    this.player = new Player(frames, signal, () => this.show());
+    // Bands of one number can have different wavelengths in the jobs; each pane names its own.
+    this.alike = new Set(jobs.map(({ dispersion }) => JSON.stringify(dispersion && (dispersion.wavelengths ?? [])))).size === 1;
+    const spectral = jobs.every((job) => job.dispersion);
+    this.player = new Player(frames, signal, () => this.show(), spectral ? (frame) => (this.alike ? frameName(jobs[0], frame) : `band ${frame}`) : undefined);
     this.player.ahead = (frame) => this.panes.every((pane, index) => pane.prepare(this.source(index, frame), ...this.contrasts[index].window()));
     this.modes = MODES.map(([value, text]) => h("button", { type: "button", id: value, "aria-pressed": String(value === this.mode), onclick: () => this.choose(value) }, text));
     const pick = (id, label, chosen) => {
@@ -131,7 +134,13 @@ class Group {
 
   source(index, frame) {
     const { levels, tile } = this.spreads[index];
-    return { base: this.base(index, frame), levels, tile, label: `Frame ${frame} of ${nameOf(this.jobs[index])}` };
+    return { base: this.base(index, frame), levels, tile, label: `${frameName(this.jobs[index], frame)} of ${nameOf(this.jobs[index])}` };
+  }
+
+  /** The name of a job, with the band that is shown if the jobs have different wavelengths. */
+  titleOf(index) {
+    const job = this.jobs[index];
+    return this.alike ? nameOf(job) : `${nameOf(job)}, ${frameName(job, this.player.frame)}`;
   }
 
   async open() {
@@ -201,7 +210,7 @@ class Group {
       this.panes.forEach((pane, index) => {
         pane.lay(null);
         pane.show(this.source(index, frame), ...window(index));
-        say(pane.title, nameOf(this.jobs[index]));
+        say(pane.title, this.titleOf(index));
       });
       return;
     }
@@ -215,13 +224,13 @@ class Group {
       const at = Number(this.wipe.value) / 1000;
       this.handle.style.left = `${100 * at}%`;
       first.lay({ source: over, at });
-      say(first.title, `${nameOf(this.jobs[one])} | ${nameOf(this.jobs[other])}`);
+      say(first.title, `${this.titleOf(one)} | ${this.titleOf(other)}`);
     } else if (this.mode === "difference") {
       first.lay({ source: over, gain: Number(this.gain.value) });
-      say(first.title, `|${nameOf(this.jobs[one])} − ${nameOf(this.jobs[other])}|`);
+      say(first.title, `|${this.titleOf(one)} − ${this.titleOf(other)}|`);
     } else {
       first.lay(null);
-      say(first.title, nameOf(this.jobs[shown]));
+      say(first.title, this.titleOf(shown));
     }
   }
 
@@ -244,6 +253,7 @@ function figures(jobs, manifests, measured) {
     measured ? ["PSNR", (_, index) => decibels(measured[index].psnr), "quality"] : ["Expected PSNR", (job) => expectedRange(job.assessment)],
     measured && ["SSIM", (_, index) => figure(measured[index].ssim, 4), "quality"],
     ["State", (job) => job.state],
+    jobs.some((job) => job.dispersion) && ["Bands", wavelengthsOf],
     ["Algorithm", (job) => job.algorithm],
     ["Planned iterations per tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],
     ["Schedule", (job) => job.schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ") || "–"],

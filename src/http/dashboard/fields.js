@@ -59,8 +59,26 @@ export function partFields(id, frames, changed, more = []) {
   return { element, value, set, setPacking };
 }
 
+const CORRECTIONS = [["", "corrected if it helps"], ["stated", "moved by a known shift"], ["off", "used as calibrated"]];
+
+/** Fields for masks that have moved since the calibration. `value()` has the setting as in a request; `changed()` is called after each edit. */
+export function shiftFields(changed) {
+  const select = h("select", { id: "registration" }, CORRECTIONS.map(([value, text]) => h("option", { value }, text)));
+  const shift = [numberField("shift-rows", "Masks moved down, in pixels"), numberField("shift-columns", "Masks moved right, in pixels")];
+  const arrange = () => shift.forEach(({ element }) => (element.hidden = select.value !== "stated"));
+  for (const input of [select, ...shift.map((one) => one.input)]) {
+    input.addEventListener("change", () => {
+      arrange();
+      changed();
+    });
+  }
+  arrange();
+  const value = () => (select.value === "stated" ? { shift: shift.map((one) => one.value() ?? 0) } : select.value || null);
+  return { elements: [h("label", { for: "registration" }, "Masks that have moved are", select), shift.map((one) => one.element)], value };
+}
+
 const AXES = [["column", "to the right, along a row"], ["row", "downwards, along a column"]];
-const EXTENTS = [["scene", "the scene: it has the size of a band"], ["measurement", "the measurement: it has its size"]];
+const EXTENTS = [["scene", "the scene, like one band"], ["measurement", "the whole measurement"]];
 
 /** The numbers of a text, START:STEP:COUNT or a list; null if it is empty. Throws for other texts. */
 export function numbersOf(text) {
@@ -101,7 +119,7 @@ export function dispersionFields(changed) {
   const summary = h("p", { class: "muted", "aria-live": "polite" });
   const element = h("div", { hidden: true },
     h("p", { class: "muted" }, "One mask codes all bands, and a prism or grating displaces them. State START:STEP:COUNT, such as 0:2:28 for 28 bands at 2 pixels per band, or a list, such as 0, 1.8, 3.9."),
-    h("div", { class: "fields" }, [offsets, wavelengths, axis, mask].map((one) => one.element)), summary);
+    h("div", { class: "fields pairs" }, [offsets, wavelengths, axis, mask].map((one) => one.element)), summary);
   const value = () => {
     const found = { axis: axis.input.value, mask: mask.input.value, offsets: numbersOf(offsets.input.value), wavelengths: numbersOf(wavelengths.input.value) };
     if (!found.offsets) throw new Error("State the displacement of each band.");

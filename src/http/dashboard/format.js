@@ -8,18 +8,20 @@ export function expectedRange(assessment) {
   if (!assessment || assessment.psnr_db === null) return "–";
   const { psnr_low_db: low, psnr_high_db: high } = assessment;
   if (low >= 40) return "40 dB or more";
-  return high >= 40 ? `${low} dB or more` : `${low} to ${high} dB`;
+  return high >= 40 ? `${low.toFixed(1)} dB or more` : `${low.toFixed(1)} to ${high.toFixed(1)} dB`;
 }
 
-/** An estimated duration without digits that are uncertain: 75 -> "2 min". */
+/** An estimated duration without digits that are uncertain: 75 -> "2 min", 8000 -> "3 h". */
 export function roughly(seconds) {
-  return duration(seconds > 60 ? 60 * Math.ceil(seconds / 60) : Math.max(1, seconds));
+  const digit = seconds > 7200 ? 3600 : seconds > 60 ? 60 : 1;
+  return duration(digit * Math.max(1, Math.ceil(seconds / digit)));
 }
 
 /** 75 -> "1 min 15 s". */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   const whole = Math.max(0, Math.round(seconds));
+  if (whole === 0) return "less than 1 s";
   if (whole < 60) return `${whole} s`;
   const pair = (large, one, small, other) => `${large} ${one}${small > 0 ? ` ${small} ${other}` : ""}`;
   if (whole < 3600) return pair(Math.floor(whole / 60), "min", whole % 60, "s");
@@ -82,6 +84,12 @@ export function frameName({ dispersion }, frame) {
   return `${dispersion ? "band" : "frame"} ${frame}${wavelength === undefined ? "" : ` · ${figure(wavelength, 4)} nm`}`;
 }
 
+/** "28, 450 to 650 nm"; the number of bands, or "none", where no wavelengths are known. */
+export function wavelengthsOf({ dispersion, shape }) {
+  const nm = dispersion?.wavelengths;
+  return nm ? `${nm.length}, ${figure(nm[0], 4)} to ${figure(nm.at(-1), 4)} nm` : dispersion ? String(shape.frames) : "none";
+}
+
 /** The axis of a job's frames, and their places on it: numbers from 1, or wavelengths. */
 export function axisOf({ dispersion, shape }) {
   const numbers = Array.from({ length: shape.frames }, (_, index) => index + 1);
@@ -113,13 +121,19 @@ export function stageOf(job) {
 
 /** Remaining time of an active job, or duration of a job that has ended. */
 export function timeOf(job) {
-  const { eta_seconds: eta, queue_position: position } = job.progress;
-  if (job.state === "queued") return [position && `position ${position} in the queue`, eta === null ? "no worker running" : `done in up to about ${roughly(eta)}`].filter(Boolean).join(", ");
+  const { queue_position: position } = job.progress;
+  return [job.state === "queued" && position && `position ${position} in the queue`, remaining(job)].filter(Boolean).join(", ");
+}
+
+/** Remaining time or duration of a job, without its position in the queue. */
+export function remaining(job) {
+  const { eta_seconds: eta } = job.progress;
+  if (job.state === "queued") return eta === null ? "no worker running" : `done in up to about ${roughly(eta)}`;
   if (job.state === "running") return eta === null ? "no worker running" : `up to about ${roughly(eta)} left`;
   if (job.state === "cancelling") return "stopping";
   if (!job.started_at || !job.finished_at) return "";
   const seconds = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
-  return `${job.state === "succeeded" ? "took" : "after"} ${seconds < 1 ? "less than 1 s" : duration(seconds)}`;
+  return `${job.state === "succeeded" ? "took" : "after"} ${duration(seconds)}`;
 }
 
 /** Maximum number of iterations of a schedule on one tile. */

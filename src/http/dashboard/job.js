@@ -20,7 +20,7 @@ export async function job(root, [id], signal) {
   const progress = h("div", { class: "progressline" });
   const problem = h("div");
   const snapshot = snapshotChoice(found);
-  const files = h("div", { class: "row downloads", role: "group", "aria-label": "Downloads" });
+  const files = h("div", { class: "card row downloads", role: "group", "aria-label": "Downloads" });
   const verdict = new Verdict(found, signal);
   const viewer = new Viewer(found, signal);
   viewer.next = () => snapshot.next();
@@ -139,7 +139,7 @@ const ORDER = Object.keys(NAMES);
 const MIN_MOVIE_SIDE = 16;
 
 /** Shows the downloads of a snapshot, and those of the whole job once it has succeeded; true if the snapshot's files are written. */
-async function showFiles(element, { id, state, shape, snapshots: { count } }, snapshot, signal) {
+async function showFiles(element, { id, state, shape, dispersion, snapshots: { count } }, snapshot, signal) {
   const base = `/v1/jobs/${id}`;
   const { ready, files } = await get(`${base}/snapshots/${snapshot}`, signal);
   // The files' own references are relative to the address of the list.
@@ -159,6 +159,6 @@ async function showFiles(element, { id, state, shape, snapshots: { count } }, sn
     ready && movieLink(base, snapshot, "gif", "GIF for presentations", signal),
     ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "mp4", "Movie of all snapshots", signal),
     ready && state === "succeeded" && made(`${base}/exports/zip`, "All files as ZIP"),
-    h("details", null, h("summary", null, `${shape.frames} single frames as EXR and PNG`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
+    h("details", null, h("summary", null, `${shape.frames} single ${dispersion ? "bands" : "frames"} as EXR and PNG`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
   return ready;
 }

@@ -2,7 +2,7 @@
 
 import { announce, h, place, put, say } from "./dom.js";
 import { cancelAll, removeAll, actions } from "./actions.js";
-import { aboutDecibels, decibels, doubts, expectedRange, measuredVerdict, moment, momentInFull, nameOf, shapeOf, short, stageOf, timeOf, verdictOf } from "./format.js";
+import { aboutDecibels, decibels, doubts, expectedRange, measuredVerdict, moment, momentInFull, nameOf, remaining, shapeOf, short, stageOf, verdictOf } from "./format.js";
 import { filters } from "./filters.js";
 import { get } from "./api.js";
 import { qualityOf } from "./quality.js";
@@ -44,6 +44,7 @@ export async function jobs(root, [query], signal) {
     };
     put(picked, h("b", null, `${found.length} selected`),
       found.length >= 2 && found.length <= MAX_COMPARED && h("a", { class: "button small", id: "compare", href: `#/compare/${found.map((job) => job.id).reverse().join("/")}` }, "Compare"),
+      found.length === 1 && h("span", { class: "muted" }, `Select up to ${MAX_COMPARED} jobs to compare them.`),
       found.length > MAX_COMPARED && h("span", { class: "muted" }, `(up to ${MAX_COMPARED} can be compared)`),
       live.length > 0 && h("button", { type: "button", class: "small writes", id: "cancel-all", onclick: () => cancelAll(live).then(after) }, `Cancel ${live.length}`),
       ended.length > 0 && h("button", { type: "button", class: "small delete writes", id: "delete-all", onclick: () => removeAll(ended).then((deleted) => deleted && after()) }, `Delete ${ended.length}`),
@@ -73,6 +74,7 @@ export async function jobs(root, [query], signal) {
     const first = nothing && !filter.value().state && !filter.value().search;
     rows.element.hidden = nothing;
     bar.hidden = first;
+    scroller.classList.toggle("bare", first);
     if (empty.hidden === nothing) {
       empty.hidden = !nothing;
       put(empty, nothing && (first ? welcome() : h("p", { class: "note" }, "No matching jobs. ", h("a", { href: "#/jobs" }, "All jobs"))));
@@ -239,11 +241,14 @@ function name(cell, job, before) {
 function state(cell, job, before) {
   if (before?.state !== job.state) {
     const running = job.state === "running" || job.state === "cancelling";
-    put(cell, h("span", { class: "line" }, h("span", { class: `badge ${job.state}`, title: job.error }, job.state), running && h("progress", { max: 100, "aria-label": `Progress of ${nameOf(job)}` })), h("span", { class: "sub" }));
+    put(cell, h("span", { class: "line" }, h("span", { class: `badge ${job.state}`, title: job.error }, job.state), running && h("progress", { max: 100, "aria-label": `Progress of ${nameOf(job)}` }), h("span", { class: "muted" })), h("span", { class: "sub" }));
   }
   const bar = cell.querySelector("progress");
   if (bar) bar.value = job.progress.percent;
-  say(cell.lastChild, [bar && `${Math.floor(job.progress.percent)} %`, bar && stageOf(job), timeOf(job)].filter(Boolean).join(" · "));
+  const { queue_position: position, percent } = job.progress;
+  say(cell.querySelector(".muted"), bar ? `${Math.floor(percent)} %` : job.state === "queued" && position ? `position ${position}` : "");
+  say(cell.lastChild, remaining(job));
+  cell.title = bar ? stageOf(job) : "";
 }
 
 /**
@@ -255,7 +260,7 @@ function verdict(cell, job, before) {
   if (same) return;
   const found = doubts(job);
   const mark = found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text);
-  const show = (kind, word, psnr) => put(cell, word && h("span", { class: `grade ${kind}` }, word), h("span", { class: "sub" }, mark, mark && psnr && " · ", psnr));
+  const show = (kind, word, psnr) => put(cell, word && h("span", { class: `grade ${kind}` }, word), h("span", { class: "sub" }, mark, psnr && h("span", { class: "psnr" }, mark && " · ", psnr)));
   const expected = () => {
     const [kind, word] = job.state === "succeeded" ? verdictOf(job) : ["", ""];
     const psnr = job.assessment?.psnr_db ?? null;

@@ -41,7 +41,7 @@ async function show() {
   const found = VIEWS.map(([pattern, title, load]) => ({ match: pattern.exec(path), title, load })).find((view) => view.match);
   mark(path);
   if (!found) {
-    put(root, h("h1", null, "Page not found"), h("p", null, h("a", { href: "#/jobs" }, "All jobs")));
+    missing("Page not found", "This address names no page of the dashboard.");
     return;
   }
   document.title = `${found.title} – sci-recon`;
@@ -53,7 +53,7 @@ async function show() {
   } catch (error) {
     if (isAborted(error) || signal.aborted) return;
     if (isUnreachable(error)) silent(signal);
-    else if (error.status === 404) missing(error);
+    else if (error.status === 404) missing("Not found", `${error.message.replace(/^./, (letter) => letter.toUpperCase())}.`);
     else if (!forbidden(error) && error.status !== 401) root.append(trouble(error));
   }
 }
@@ -70,17 +70,21 @@ function silent(signal) {
   signal.addEventListener("abort", () => clearTimeout(timer));
 }
 
-function missing(error) {
+function missing(title, reason) {
   clear();
-  put(root, h("div", { class: "card gate" }, h("h1", null, "Not found"), h("p", null, error.message), h("p", null, h("a", { href: "#/jobs" }, "All jobs"))));
+  document.title = `${title} – sci-recon`;
+  put(root, h("div", { class: "card gate" }, h("h1", null, title), h("p", null, reason), h("p", null, h("a", { href: "#/jobs" }, "All jobs"))));
 }
 
 /** Marks the menu entry of the current view. */
 function mark(path) {
   for (const entry of document.querySelectorAll("#nav a")) {
     const here = path.startsWith(entry.getAttribute("href").slice(1));
-    if (here) entry.setAttribute("aria-current", "page");
-    else entry.removeAttribute("aria-current");
+    if (here) {
+      entry.setAttribute("aria-current", "page");
+      // On a phone, the menu may be wider than the screen.
+      entry.scrollIntoView({ block: "nearest", inline: "nearest" });
+    } else entry.removeAttribute("aria-current");
   }
 }
 
@@ -105,7 +109,7 @@ addEventListener("forbidden", ({ detail }) => {
 });
 
 function enter() {
-  nameplate(document.getElementById("who"));
+  nameplate(document.getElementById("who")).then((answered) => answered && link(true));
   show();
 }
 

@@ -19,7 +19,7 @@ export class Made {
       ["Algorithm", job.algorithm],
       job.schedule.stages.length > 0 && ["Planned", `at most ${iterationsOf(job.schedule)} iterations per tile: ${stages(job.schedule)}`],
       job.shape.mosaic && ["Colour", `sensor ${job.shape.mosaic.toUpperCase()}: four sub-images, then demosaicked (Malvar, He and Cutler)`],
-      job.dispersion && ["Dispersion", `${job.dispersion.offsets.length} bands, displaced by up to ${figure(Math.max(...job.dispersion.offsets))} pixels along a ${job.dispersion.axis}`],
+      job.dispersion && ["Dispersion", `${job.dispersion.offsets.length} bands, displaced by up to ${figure(Math.max(...job.dispersion.offsets))} pixels ${job.dispersion.axis === "column" ? "to the right" : "downwards"}`],
       ["Tiles", `${job.tile.size} pixels${job.shape.mosaic ? " of a sub-image" : ""}, overlap ${job.tile.overlap}`],
       job.priority !== 0 && ["Priority", job.priority],
       ["Calibration", h("a", { href: `#/calibrations/${job.calibration}` }, h("code", null, job.calibration))],

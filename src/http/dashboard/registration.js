@@ -25,7 +25,7 @@ function answer({ applied, reason: doubt, shift, uncertainty }) {
 const percent = (squared) => `${figure(100 * Math.sqrt(squared), 3)} %`;
 
 function reason({ applied, reason: doubt, shift, uncertainty, error_before: before, error_after: after }) {
-  if (doubt) return `Nothing was corrected: ${doubt}.`;
+  if (doubt && !applied) return `Nothing was corrected: ${doubt}.`;
   const errors = before !== null && after !== null;
   if (!applied) return errors ? `No displacement lowers the error at hold-out pixels (${percent(before)}) significantly. The frames use the masks as they were calibrated.` : "The frames use the masks as they were calibrated.";
   const way = directions(shift, uncertainty);
@@ -42,7 +42,7 @@ function directions(shift, uncertainty) {
     const places = Math.min(6, Math.max(0, Math.ceil(-Math.log10(error))));
     return `${by.toFixed(places)} ± ${error.toFixed(places)}`;
   };
-  const one = (by, axis) => `${size(Math.abs(by), axis)} pixels ${names[axis][by < 0 ? 1 : 0]}`;
+  const one = (by, axis) => `${size(Math.abs(by), axis)} ${size(Math.abs(by), axis) === "1" ? "pixel" : "pixels"} ${names[axis][by < 0 ? 1 : 0]}`;
   return `by ${shift.map(one).join(" and ")}`;
 }
 

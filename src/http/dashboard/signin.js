@@ -111,14 +111,16 @@ function signOut() {
   return h("button", { type: "button", id: "sign-out", onclick: leave }, "Sign out");
 }
 
-/** Shows the lab and role in the header. */
+/** Shows the lab and role in the header; true if the service has answered. */
 export async function nameplate(element) {
   try {
     const me = await get("/v1/me");
     say(element, me.token ? `${selectedLab() ? "viewing " : ""}${me.lab} · ${me.role}` : me.lab);
     document.body.dataset.role = me.role;
     element.hidden = false;
+    return true;
   } catch {
     element.hidden = true;
+    return false;
   }
 }

@@ -7,14 +7,18 @@ import { bytes, exact, figure, roughly } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings, grade } from "./report.js";
 import { create, isAborted, get, send } from "./api.js";
-import { dispersionFields, given, numberField, partFields, textField } from "./fields.js";
+import { dispersionFields, given, numberField, partFields, shiftFields, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
 const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
 
 export async function submit(root, [query], signal) {
-  const form = { calibration: null, measurement: null, truth: null };
-  const [known, algorithms] = await Promise.all([get("/v1/calibrations?limit=200", signal), get("/v1/algorithms", signal)]);
+  const form = { calibration: null, measurement: null };
+  const [known, algorithms, me] = await Promise.all([get("/v1/calibrations?limit=200", signal), get("/v1/algorithms", signal), get("/v1/me", signal)]);
+  if (me.role === "read") {
+    dispatchEvent(new CustomEvent("forbidden", { detail: "this needs the role submit; the token has read" }));
+    return;
+  }
   const button = h("button", { type: "submit", class: "primary large", disabled: true }, "Submit the job");
   const result = h("div", { "aria-live": "polite" });
   const job = jobStep(algorithms.items.filter((item) => item.planned_iterations > 0), form, signal);
@@ -25,7 +29,8 @@ export async function submit(root, [query], signal) {
   const measurement = measurementStep(form, changed, signal);
   const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, query.get("calibration"), signal);
   form.vary = calibration.vary;
-  const element = h("form", { class: "steps" }, calibration.element, measurement.element, job.element, h("div", { class: "row" }, button), result);
+  const finish = h("section", { class: "card finish", "aria-label": "Submit" }, h("h2", null, "Cost"), job.estimate, h("div", { class: "row" }, button), result);
+  const element = h("form", { class: "steps" }, calibration.element, measurement.element, job.element, finish);
   element.addEventListener("submit", async (event) => {
     event.preventDefault();
     button.disabled = true;
@@ -43,6 +48,22 @@ export async function submit(root, [query], signal) {
 
 function step(number, title, ...content) {
   return h("section", { class: "card step", "aria-label": title }, h("h2", null, h("span", { class: "stepnumber" }, number), title), content);
+}
+
+/** A drop zone for a file that may be absent, in a closed group. `value()` is its hash or null; `changed()` is called after a change. */
+function optionalFile(id, title, hint, signal, changed) {
+  let held = null;
+  const take = (sha256) => {
+    held = sha256;
+    forget.hidden = held === null;
+    changed();
+  };
+  const zone = dropZone(id, title, hint, signal, async (blob) => take(blob.sha256));
+  const forget = h("button", { type: "button", class: "small below", hidden: true, onclick: () => {
+    zone.clear();
+    take(null);
+  } }, `Remove the ${title[0].toLowerCase()}${title.slice(1)}`);
+  return { element: h("details", null, h("summary", null, title), zone.element, forget), value: () => held };
 }
 
 /** A group of radio buttons. */
@@ -65,7 +86,8 @@ function calibrationStep(form, known, wake, wanted, signal) {
   const sensorLabel = h("label", { for: "mosaic" }, "The sensor is", sensor);
   const nameRow = h("div", { class: "fields" }, name.element, sensorLabel);
   const isSpectral = () => sensor.value === SPECTRAL;
-  const settings = () => given({ name: name.value(), mosaic: isSpectral() ? null : sensor.value || null });
+  const bad = optionalFile("bad-pixels", "Map of bad pixels", "Optional: an image of the size of the masks that is not 0 at bad pixels. The reconstruction leaves these pixels out.", signal, () => kind === "masks" && made.repeat());
+  const settings = () => given({ name: name.value(), mosaic: isSpectral() ? null : sensor.value || null, bad_pixels: bad.value() });
   const made = masks(() => given({ ...settings(), dispersion: isSpectral() ? dispersion.value() : null }), use, verdict, signal);
   const dispersion = dispersionFields(() => made.repeat());
   // A change of the sensor repeats the request with the same file.
@@ -85,14 +107,14 @@ function calibrationStep(form, known, wake, wanted, signal) {
   const show = (value) => {
     kind = value;
     for (const [key, part] of Object.entries(parts)) part.element.hidden = key !== value;
-    nameRow.hidden = value === "known";
+    nameRow.hidden = bad.element.hidden = value === "known";
     arrange();
     put(verdict);
     use(null);
     parts[value].wake?.();
   };
   const radios = choice("calibration-kind", "What do you have?", options, kind, show);
-  const element = step(1, "Calibration", radios, nameRow, dispersion.element, Object.values(parts).map((part) => part.element), verdict);
+  const element = step(1, "Calibration", radios, nameRow, dispersion.element, Object.values(parts).map((part) => part.element), bad.element, verdict);
   queueMicrotask(() => show(kind));
   /** Makes another calibration from the masks of the present one, with another window or other masks of a spectral camera. */
   const vary = ({ crop, mask }) => {
@@ -118,7 +140,8 @@ function stored(known, wanted, use, signal) {
   const wake = () => use(chosen());
   const option = (item) => h("label", { class: "pickone" }, h("input", { type: "radio", name: "calibration", value: item.id, checked: item.id === wanted, onchange: wake }), ...glance(item, signal));
   const element = h("div", { class: "pickings", role: "radiogroup", "aria-label": "Calibrations" }, known.map(option));
-  return { element, wake };
+  const missing = wanted && !known.some((item) => item.id === wanted) && h("p", { class: "warn" }, "The calibration of this link does not exist. Select another one.");
+  return { element: h("div", null, missing, element), wake };
 }
 
 function masks(settings, use, verdict, signal) {
@@ -180,14 +203,14 @@ function captures(settings, use, verdict, signal) {
 function accepted(item, signal) {
   const dead = item.dead_pixels / (item.height * item.width);
   return [
-    h("p", null, "The calibration is accepted. ", grade(item.id, signal)),
+    h("p", null, "The calibration is accepted."),
     facts([
       [item.dispersion ? "Masks of bands" : "Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them`) : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
-      ["Report", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "grade and findings (new tab)")],
+      ["Grade", [grade(item.id, signal), " ", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "Report (new tab)")]],
     ]),
   ];
 }
@@ -203,11 +226,11 @@ function measurementStep(form, changed, signal) {
   const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
   const darks = [];
   const darkList = h("p", { class: "muted" });
-  const forget = h("button", { type: "button", class: "small", hidden: true, onclick: () => setDarks([]) }, "Remove the dark captures");
+  const held = h("div", { class: "row below", hidden: true }, darkList, h("button", { type: "button", class: "small", onclick: () => setDarks([]) }, "Remove the dark captures"));
   const setDarks = (next) => {
     darks.splice(0, darks.length, ...next);
     say(darkList, darks.length ? `The mean of ${darks.map((dark) => dark.name).join(", ")} is subtracted.` : "");
-    forget.hidden = darks.length === 0;
+    held.hidden = darks.length === 0;
     if (last) make(last, known).catch((error) => put(verdict, problem(error)));
   };
   const part = partFields("data-part", false, () => last && make(last, known).catch((error) => put(verdict, problem(error))), [saturation]);
@@ -247,12 +270,12 @@ function measurementStep(form, changed, signal) {
     input.addEventListener("change", () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
-  const dark = dropZone("darks", "Dark captures", "Optional: with the LCoS all black and the same exposure", signal, async (blob, file) => {
+  const dark = dropZone("darks", "Dark captures", "Optional: recorded while the modulator is black, at the same exposure", signal, async (blob, file) => {
     setDarks([...darks, { sha256: blob.sha256, name: file.name }]);
   }, true);
   const inside = h("div", { hidden: true },
     h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Sequence of snapshots", sequence)),
-    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row below" }, darkList, forget))), part.element);
+    h("div", { class: "two" }, drop.element, h("div", null, dark.element, held)), part.element);
   const wake = () => {
     attempt += 1;
     inside.hidden = !form.calibration;
@@ -268,8 +291,9 @@ function measurementStep(form, changed, signal) {
 
 function fits(item) {
   const wrong = findings(item.warnings);
+  const severe = item.warnings.some(({ severity }) => severity === "error");
   return [
-    h("p", { class: wrong ? "warn" : "good" }, wrong ? "The measurement is accepted with warnings:" : "The measurement fits the calibration."),
+    h("p", { class: severe ? "bad" : wrong ? "warn" : "good" }, severe ? "The measurement is accepted, but the checks found errors:" : wrong ? "The measurement is accepted with warnings:" : "The measurement fits the calibration."),
     wrong,
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
@@ -282,11 +306,11 @@ function fits(item) {
 function jobStep(algorithms, form, signal) {
   const select = h("select", { id: "algorithm" }, algorithms.map((item) => h("option", { value: item.name, selected: item.name === "pnp-tv-fastdvdnet" }, item.name)));
   const label = textField("label", "Name of the job", "drop of milk, first try");
-  const registration = h("select", { id: "registration" }, [["", "corrected if it helps"], ["off", "not corrected"]].map(([value, text]) => h("option", { value }, text)));
+  const registration = shiftFields(() => renew());
   const priority = numberField("priority", "Priority, −100 to 0", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
-  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth, registration: registration.value || null }) });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: truth.value(), registration: registration.value() }) });
   const ask = calmly(250, async () => {
     if (!form.measurement || signal.aborted) return;
     const asked = JSON.stringify(request());
@@ -300,27 +324,15 @@ function jobStep(algorithms, form, signal) {
   const renew = () => {
     const item = algorithms.find((found) => found.name === select.value);
     say(plan, `${item.summary} At most ${item.planned_iterations} iterations per tile.`);
-    if (!form.measurement) put(estimate);
+    if (!form.measurement) put(estimate, h("p", { class: "muted" }, "Time, memory and disk are estimated when the measurement is accepted."));
     ask();
   };
-  const truth = dropZone("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, async (blob) => {
-    form.truth = blob.sha256;
-    forget.hidden = false;
-    ask();
-  });
-  const forget = h("button", { type: "button", class: "small below", hidden: true, onclick: () => {
-    form.truth = null;
-    forget.hidden = true;
-    truth.clear();
-    ask();
-  } }, "Remove the true frames");
+  const truth = optionalFile("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, () => ask());
   select.addEventListener("change", renew);
-  registration.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, h("label", { for: "registration" }, "Masks that have moved are", registration), priority.element), plan,
-    h("details", null, h("summary", null, "True frames"), truth.element, forget), estimate);
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, registration.elements, priority.element), plan, truth.element);
   queueMicrotask(renew);
-  return { element, renew, request };
+  return { element, estimate, renew, request };
 }
 
 /** Estimated time, computation, memory and disk space of a job. */

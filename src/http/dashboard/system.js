@@ -18,7 +18,7 @@ export async function system(root, _, signal) {
     if (text === before) return;
     before = text;
     put(body, h("p", { class: "lead" }, summary(found)), found.degraded.map((trouble) => h("p", { class: "trouble" }, trouble)),
-      h("div", { class: "cards" }, queue(found), workers(found), disk(found), errors(failed), service(found)));
+      h("div", { class: "cards" }, queue(found), disk(found), errors(failed), workers(found), service(found)));
   }, signal);
 }
 
@@ -80,14 +80,17 @@ function errors({ items }) {
 
 function workers(found) {
   const title = `Workers: ${found.workers.length} of ${found.workers_wanted} ready`;
-  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait. Start the service with --workers 1 or more, or connect workers of other machines."));
+  if (found.workers.length === 0) return card(title, h("p", { class: "warn" }, "No worker is running, so jobs wait. Start the service with ", h("code", { class: "together" }, "--workers 1"), " or more, or connect workers of other machines."));
   const row = (worker) => h("tr", null,
-    h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version), h("td", null, worker.device ?? ""),
+    h("th", { scope: "row" }, short(worker.id)), h("td", { class: "minor" }, worker.pid), h("td", { class: "minor" }, worker.version), h("td", null, worker.device ?? ""),
     h("td", null, task(worker.task)),
     h("td", { class: "together", title: momentInFull(worker.started_at) }, moment(worker.started_at)));
-  const heads = ["Worker", "Process", "Version", "Device", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
-  return card(title, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Workers" },
+  const minor = ["Process", "Version"];
+  const heads = ["Worker", ...minor, "Device", "Task", "Running since"].map((name) => h("th", { scope: "col", class: minor.includes(name) && "minor" }, name));
+  const element = card(title, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Workers" },
     h("table", null, h("thead", null, h("tr", null, heads)), h("tbody", null, found.workers.map(row)))));
+  element.classList.add("whole");
+  return element;
 }
 
 function task(work) {

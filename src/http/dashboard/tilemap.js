@@ -7,6 +7,16 @@ import { h, put, s } from "./dom.js";
 
 const COLOURS = { r: "red", g: "green", b: "blue" };
 
+/** The place on one axis of the tiles that begin at each number: each takes its half of an overlap. `spans` has begin and end of all tiles. */
+function shares(spans) {
+  const sorted = [...new Map(spans)].sort(([one], [other]) => one - other);
+  return new Map(sorted.map(([start, end], index) => {
+    const from = index === 0 ? start : (start + sorted[index - 1][1]) / 2;
+    const to = index === sorted.length - 1 ? end : (end + sorted[index + 1][0]) / 2;
+    return [start, { from, length: to - from }];
+  }));
+}
+
 export class TileMap {
   constructor(job, signal) {
     Object.assign(this, { job, signal, chosen: null, tiles: [] });
@@ -17,6 +27,8 @@ export class TileMap {
     this.note = h("p", { class: "muted" });
     this.plot = h("div");
     this.tilesCard = h("section", { class: "card", "aria-label": "Tiles" }, h("h2", null, "Tiles"), this.map, this.note);
+    // The plot has the width of its card.
+    addEventListener("resize", () => this.points && convergence(this.plot, this.points), { signal });
     this.plotCard = h("section", { class: "card", "aria-label": "Convergence" },
       h("h2", { class: "row" }, "Convergence", h("span", { class: "grow" }), this.label), this.plot);
   }
@@ -71,16 +83,21 @@ export class TileMap {
     const unit = Math.max(width, height) / 100;
     // With a mosaic, the tiles of the four sub-images cover the same pixels: each gets a quarter of the area.
     const parts = job.shape.mosaic ? 2 : 1;
-    const at = (start, length, part) => start + unit / 2 + (part * (length - unit)) / parts;
-    const rectangle = (tile) => s("rect", {
-      x: at(tile.column, tile.width, tile.plane % 2), y: at(tile.row, tile.height, Math.floor(tile.plane / 2)),
-      width: (tile.width - unit) / parts, height: (tile.height - unit) / parts, rx: unit,
-      class: `tile ${tile.state}${tile.tile === this.chosen ? " chosen" : ""}`, "stroke-width": unit / 2,
-      onclick: () => {
-        this.select.value = tile.tile;
-        this.choose(tile.tile);
-      },
-    }, s("title", null, `tile ${tile.tile + 1}${job.shape.mosaic ? ` (${COLOURS[job.shape.mosaic[tile.plane]]})` : ""}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
+    const columns = shares(this.tiles.map((tile) => [tile.column, tile.column + tile.width]));
+    const rows = shares(this.tiles.map((tile) => [tile.row, tile.row + tile.height]));
+    const at = ({ from, length }, part) => from + unit / 2 + (part * (length - unit)) / parts;
+    const rectangle = (tile) => {
+      const [across, down] = [columns.get(tile.column), rows.get(tile.row)];
+      return s("rect", {
+        x: at(across, tile.plane % 2), y: at(down, Math.floor(tile.plane / 2)),
+        width: (across.length - unit) / parts, height: (down.length - unit) / parts, rx: unit,
+        class: `tile ${tile.state}${tile.tile === this.chosen ? " chosen" : ""}`, "stroke-width": unit / 2,
+        onclick: () => {
+          this.select.value = tile.tile;
+          this.choose(tile.tile);
+        },
+      }, s("title", null, `tile ${tile.tile + 1}${job.shape.mosaic ? ` (${COLOURS[job.shape.mosaic[tile.plane]]})` : ""}: ${tile.state}, ${Math.round(100 * tile.fraction)} %, ${tile.iterations} iterations${tile.residual === null ? "" : `, residual ${figure(tile.residual)}`}`));
+    };
     // A single tile is the whole picture: neither a map nor a choice is needed.
     this.tilesCard.hidden = this.label.hidden = this.tiles.length === 1;
     put(this.map, s("svg", { viewBox: `0 0 ${width} ${height}`, class: "tiles", role: "img", "aria-label": text }, this.tiles.map(rectangle)));

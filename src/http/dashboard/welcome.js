@@ -49,7 +49,8 @@ export function welcome() {
     h("h1", null, "One image in, 6 to 30 frames out"), h("p", { class: "lead" }, WHAT),
     h("div", { class: "intro" }, example(), h("div", null,
       h("div", { class: "row" }, button, h("a", { class: "button large writes", href: "#/new" }, "Use my own files")), status,
-      h("p", { class: "muted" }, "The sample is a real clip, coded by a simulated camera. Its true frames are known, so the quality of the result can be measured."))),
+      h("p", { class: "readers" }, "This lab has no jobs yet. With the role read, you see them here once others submit some."),
+      h("p", { class: "muted writes" }, "The sample is a real clip, coded by a simulated camera. Its true frames are known, so the quality of the result can be measured."))),
     h("ol", { class: "threesteps" }, STEPS.map(([title, text]) => h("li", null, h("h2", null, title), h("p", null, text)))));
 }
 
