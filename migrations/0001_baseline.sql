@@ -315,6 +315,8 @@ CREATE TABLE result_files (
     name       TEXT NOT NULL, -- path below the snapshot's folder, such as frames/frame_0001.exr
     size       INTEGER NOT NULL,
     sha256     TEXT NOT NULL,
+    crc32      INTEGER NOT NULL, -- by which archives check the file
+    derived    INTEGER NOT NULL, -- 1 for a file that is not on the disk, but composed of others when it is read
     damaged_at INTEGER, -- when the file was found missing or changed; NULL if it is believed sound
     PRIMARY KEY (job, snapshot, name)
 ) STRICT, WITHOUT ROWID;
@@ -424,17 +426,21 @@ CREATE INDEX tasks_light ON tasks (lab, priority DESC, ordinal) WHERE state = 'r
 CREATE INDEX tasks_light_of_job ON tasks (job, ordinal)
     WHERE state = 'ready' AND light = 1 AND job IS NOT NULL;
 
+-- Derived files take no room.
 CREATE TRIGGER result_files_add AFTER INSERT ON result_files
+    WHEN NOT NEW.derived
 BEGIN
     UPDATE jobs SET result_bytes = result_bytes + NEW.size WHERE id = NEW.job;
 END;
 
 CREATE TRIGGER result_files_change AFTER UPDATE OF size ON result_files
+    WHEN NOT NEW.derived
 BEGIN
     UPDATE jobs SET result_bytes = result_bytes + NEW.size - OLD.size WHERE id = NEW.job;
 END;
 
 CREATE TRIGGER result_files_remove AFTER DELETE ON result_files
+    WHEN NOT OLD.derived
 BEGIN
     UPDATE jobs SET result_bytes = result_bytes - OLD.size WHERE id = OLD.job;
 END;

@@ -38,7 +38,7 @@ use engine::pipeline::registration;
 use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
-use engine::pipeline::write::{check_output, replace_result, write_result};
+use engine::pipeline::write::{OnDisk, check_output, replace_result, write_result};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, Limits, Part, planar};
 use reconstruction::sequence::SequencePlan;
@@ -539,7 +539,7 @@ fn write(
     fs::create_dir_all(out).map_err(failed)?;
     // If writing fails, an earlier result remains.
     let draft = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
-    write_result(draft.path(), manifest, error, |k| Ok(frame(k)))?;
+    write_result(draft.path(), manifest, error, OnDisk::All, |k| Ok(frame(k)))?;
     Ok(replace_result(draft.path(), out)?)
 }
 

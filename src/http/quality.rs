@@ -16,8 +16,9 @@ use super::results::{result_file, white_level};
 use super::truth::{frames_before, next_frame, open};
 use engine::intake::Opened;
 use engine::job::{JobId, SceneShape, Sha256};
+use engine::pipeline::derived::STACK;
 use engine::pipeline::quality::{FrameQuality, Quality};
-use formats::{Axes, Channels, Limits, npy};
+use formats::{Axes, Channels, exr};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -52,8 +53,8 @@ pub(super) async fn show(
         ApiError::new(Code::InvalidQuery, detail)
     })?;
     app.store.upload(&access.lab, truth).await?;
-    result_file(&app, &job, Some(snapshot), "frames.npy").await?;
-    let (file, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
+    result_file(&app, &job, Some(snapshot), STACK).await?;
+    let (file, path, _) = app.store.open_result(&job, Some(snapshot), STACK).await?;
     let measure = async {
         let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
         let (shape, limits) = (job.spec.frame_shape(), app.limits);
@@ -82,7 +83,7 @@ fn compare(
     for frame in 0..skipped {
         next_frame(&mut truth, frame)?;
     }
-    let result = npy::open_windows(path, &Limits::default())?;
+    let result = exr::open_windows(path, (frames, height, shape.width), shape.channels())?;
     let frame_quality = |k: usize| -> Result<FrameQuality> {
         let truth = next_frame(&mut truth, skipped + k)?;
         let frame = result.read_window(k..k + 1, 0..height, 0..result.info().width)?;

@@ -1,19 +1,17 @@
-//! Snapshots of a job and their stored files, which [`exports`](super::exports) serves with ETag and Range.
+//! Snapshots of a job and their files, which [`exports`](super::exports) serves with ETag and Range.
 
 use std::path::PathBuf;
 
-use axum::http::{HeaderMap, Method};
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
 
 use super::app::App;
 use super::context::RequestContext;
-use super::download::Download;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, canonical_number};
 use super::jobs::with_snapshot;
 use super::page::{Cursor, Limit, PageBody};
-use engine::job::{JobId, JobState, ResultFile};
+use engine::job::{JobId, JobState, ResultFile, WrittenFile};
 use engine::pipeline::records::WhiteRecord;
 use store::{Job, Page, StoreError};
 
@@ -80,7 +78,7 @@ async fn body(
     request: &RequestContext,
 ) -> Result<SnapshotBody> {
     let files = app.store.result_files(job, Some(snapshot)).await?;
-    let show = |file: ResultFile| {
+    let show = |WrittenFile { file, .. }: WrittenFile| {
         let href = export(&file.name).map(|export| {
             request.reference(&format!("/v1/jobs/{}/snapshots/{snapshot}/exports/{export}", job.id))
         });
@@ -119,32 +117,11 @@ pub(super) fn frame_file(frame: &str, frames: usize) -> Option<String> {
     (1..=frames).contains(&number).then(|| format!("{folder}/frame_{number:04}.{kind}"))
 }
 
-/// Answers with a result file, or the requested range of it.
-pub(super) async fn send(
-    app: &App,
-    job: &Job,
-    snapshot: Option<u32>,
-    name: &str,
-    request: (&Method, &HeaderMap),
-) -> Result<Response> {
-    let (file, _) = result_file(app, job, snapshot, name).await?;
-    let download = Download {
-        sha256: file.sha256,
-        size: file.size,
-        kind: media_type(name),
-        disposition: format!("inline; {}", file_name(job.id, snapshot, name)),
-        // A range of a JSON document is not valid JSON.
-        accepts_ranges: media_type(name) != "application/json",
-    };
-    let open = async { Ok(app.store.open_result(job, snapshot, name).await?.2) };
-    download.send(open, request).await
-}
-
 /// The reason why a finished job has no `error.npy`.
 const NO_PREDICTION: &str =
     "no error can be predicted for frames of this algorithm, schedule or sensor";
 
-/// The record and the path of a result file.
+/// The record of a result file, and its path unless it is derived.
 ///
 /// Errors: 404 if it does not exist yet.
 pub(super) async fn result_file(
@@ -152,7 +129,7 @@ pub(super) async fn result_file(
     job: &Job,
     snapshot: Option<u32>,
     name: &str,
-) -> Result<(ResultFile, PathBuf)> {
+) -> Result<(WrittenFile, PathBuf)> {
     match app.store.result_file(job, snapshot, name).await {
         Err(StoreError::NotFound { .. })
             if name == "error.npy" && job.state == JobState::Succeeded =>

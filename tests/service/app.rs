@@ -273,6 +273,20 @@ impl TestApp {
         self.send(self.request(Method::POST, path).json(body)).await
     }
 
+    /// Downloads all files of a snapshot into a folder.
+    pub async fn download(&self, job: &str, snapshot: u32) -> TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let listed = self.get(&format!("/v1/jobs/{job}/snapshots/{snapshot}")).await.expect(200);
+        for file in listed.json()["files"].as_array().unwrap() {
+            // Relative to the address of the snapshot.
+            let href = format!("/v1/jobs/{job}/snapshots/{}", file["href"].as_str().unwrap());
+            let path = folder.path().join(file["name"].as_str().unwrap());
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, self.get(&href).await.expect(200).bytes).unwrap();
+        }
+        folder
+    }
+
     /// Uploads a file and returns its hash.
     pub async fn upload(&self, bytes: Vec<u8>) -> String {
         let answer = self.send(self.request(Method::POST, "/v1/blobs").body(bytes)).await;

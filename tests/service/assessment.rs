@@ -103,7 +103,7 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
     let (_, measurement) = app.scene(&scene).await;
     let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
     assert_eq!(app.ended(&job).await["state"], "succeeded");
-    let folder = app.data().join("results").join(&job).join("snapshot_0001");
+    let folder = app.download(&job, 1).await;
     let plain = format!("/v1/jobs/{job}/snapshots/1/exports/exr");
     let path = format!("{plain}?layers=sigma");
     let complete = app.get(&path).await.expect(200);
@@ -119,7 +119,7 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
     std::fs::write(file.path(), &complete.bytes).unwrap();
     if let Some(python) = judges() {
         let mut judge = tokio::process::Command::new(python);
-        judge.arg("tests/judges/read_exr.py").arg(&folder).args(["--attribute", "algorithm"]);
+        judge.arg("tests/judges/read_exr.py").arg(folder.path()).args(["--attribute", "algorithm"]);
         let output = judge.arg("--sigma").arg(file.path()).output().await.unwrap();
         let report = String::from_utf8_lossy(&output.stdout).into_owned();
         assert!(output.status.success(), "{report}{}", String::from_utf8_lossy(&output.stderr));
@@ -138,7 +138,7 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
 
     // Without the parameter, the original file is sent.
     let stored = app.get(&plain).await.expect(200);
-    assert!(stored.bytes == std::fs::read(folder.join("stack.exr")).unwrap());
+    assert!(stored.bytes == std::fs::read(folder.path().join("stack.exr")).unwrap());
     assert_ne!(stored.header("etag"), etag);
     for wrong in ["layers=depth", "layers=", "layer=sigma"] {
         let why = app.get(&format!("{plain}?{wrong}")).await.problem(400, "invalid_query");
@@ -146,9 +146,10 @@ async fn the_expected_error_is_an_optional_layer_of_the_exr() {
     }
 
     // A damaged file is not sent.
-    let mut bytes = std::fs::read(folder.join("error.npy")).unwrap();
+    let errors = app.data().join("results").join(&job).join("snapshot_0001/error.npy");
+    let mut bytes = std::fs::read(&errors).unwrap();
     *bytes.last_mut().unwrap() ^= 1;
-    std::fs::write(folder.join("error.npy"), bytes).unwrap();
+    std::fs::write(errors, bytes).unwrap();
     app.get(&path).await.problem(500, "file_damaged");
     app.get(&plain).await.expect(200);
 }

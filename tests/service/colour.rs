@@ -203,7 +203,10 @@ async fn a_mosaic_is_reconstructed_in_colour() {
         json!({"mosaic": "grbg", "demosaicking": "malvar-he-cutler-2004"})
     );
     assert_eq!(manifest["content"]["tile_plan"]["tiles"][5], json!([0, 16, 48, 48]));
-    judge_exr(&app.data().join("results").join(&job).join("snapshot_0001"));
+    let folder = app.download(&job, 1).await;
+    judge_exr(folder.path());
+    let stored = app.data().join("results").join(&job).join("snapshot_0001");
+    assert!(!stored.join("mosaic.npy").exists() && folder.path().join("mosaic.npy").exists());
 
     // Export formats.
     let zarr = app.get(&format!("{base}/exports/zarr/0/zarr.json")).await.expect(200).json();

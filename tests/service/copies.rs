@@ -78,7 +78,7 @@ async fn done(app: &TestApp) -> (String, String) {
 }
 
 fn frames_of(app: &TestApp, job: &str) -> PathBuf {
-    app.data().join("results").join(job).join("snapshot_0000/frames.npy")
+    app.data().join("results").join(job).join("snapshot_0000/stack.exr")
 }
 
 #[tokio::test]
@@ -95,14 +95,19 @@ async fn a_damaged_result_is_not_served_and_is_computed_again() {
 
     flip_a_bit(&frames_of(&app, &job), true);
     let detail = app.get(&path).await.problem(500, "file_damaged");
-    assert!(detail.contains("frames.npy") && detail.contains("retry"), "{detail}");
+    assert!(detail.contains("stack.exr") && detail.contains("retry"), "{detail}");
     let range = app.request(reqwest::Method::GET, &path).header("range", "bytes=0-9");
     app.send(range).await.problem(500, "file_damaged");
+    for derived in ["exr", "frames/1.exr", "tiff"] {
+        let path = format!("/v1/jobs/{job}/snapshots/0/exports/{derived}");
+        app.get(&path).await.problem(500, "file_damaged");
+    }
     app.get(&format!("/view/jobs/{job}/snapshots/0/pictures/frame-1"))
         .await
         .problem(500, "file_damaged");
     // Intact files are served, and a client with the right bytes gets 304.
-    app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/exr")).await.expect(200);
+    app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/frames/1.png")).await.expect(200);
+    app.get(&format!("/v1/jobs/{job}/snapshots/1/exports/npy")).await.expect(200);
     let known = app.request(reqwest::Method::GET, &path).header("if-none-match", &etag);
     app.send(known).await.expect(304);
     let (good, found) = verify(app.data());
@@ -130,7 +135,7 @@ async fn a_damaged_result_is_not_served_and_is_computed_again() {
     let mut database = app.database().await;
     let mut sums = async || -> (i64, i64) {
         let sums = "SELECT (SELECT coalesce(sum(result_bytes), 0) FROM jobs),
-                           (SELECT coalesce(sum(size), 0) FROM result_files)";
+                           (SELECT coalesce(sum(size), 0) FROM result_files WHERE NOT derived)";
         sqlx::query_as(sums).fetch_one(&mut database).await.unwrap()
     };
     let (charged, stored) = sums().await;
@@ -197,7 +202,7 @@ async fn backup_and_verify_name_missing_files() {
     let blob = format!("blobs/{}/{}", &masks[..2], &masks[2..]);
     std::fs::remove_file(app.data().join(&blob)).unwrap();
     std::fs::remove_file(frames_of(&app, &job)).unwrap();
-    let frames = format!("results/{job}/snapshot_0000/frames.npy");
+    let frames = format!("results/{job}/snapshot_0000/stack.exr");
     let reports = [back_up("less"), verify(app.data()), verify(&folder.path().join("less"))];
     for (is_good, report) in reports {
         assert!(!is_good);

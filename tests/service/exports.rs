@@ -7,6 +7,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 
 use crate::app::{Answer, TestApp, has_programs, id, judges, skip};
+use crate::faults::sha256;
 use crate::limits::entitle;
 use crate::samples::Scene;
 
@@ -110,11 +111,11 @@ async fn exports_support_caching_and_ranges_like_files() {
 
     // A damaged file is not sent.
     let results = app.data().join("results").join(&job);
-    let array = results.join("snapshot_0001/frames.npy");
-    let mut bytes = std::fs::read(&array).unwrap();
+    let stack = results.join("snapshot_0001/stack.exr");
+    let mut bytes = std::fs::read(&stack).unwrap();
     let last = bytes.len() - 1;
     bytes[last] ^= 1;
-    std::fs::write(&array, bytes).unwrap();
+    std::fs::write(&stack, bytes).unwrap();
     for path in ["snapshots/1/exports/tiff", "snapshots/1/exports/zarr/0/c/3/0/0"] {
         app.get(&format!("/v1/jobs/{job}/{path}")).await.problem(500, "file_damaged");
     }
@@ -122,6 +123,64 @@ async fn exports_support_caching_and_ranges_like_files() {
     let cut =
         app.request(Method::GET, &format!("/v1/jobs/{job}/exports/zip")).send().await.unwrap();
     assert!(cut.bytes().await.is_err(), "the archive breaks off before the damaged file");
+}
+
+#[tokio::test]
+async fn frames_are_stored_once_and_every_listed_file_is_served() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let job = done(&app).await;
+    let results = app.data().join("results").join(&job);
+    let names = |folder: &str| {
+        let entries = std::fs::read_dir(results.join(folder)).unwrap();
+        let mut names: Vec<_> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    };
+    assert_eq!(names("."), ["manifest.json", "snapshot_0000", "snapshot_0001"]);
+    let mut on_disk = std::fs::metadata(results.join("manifest.json")).unwrap().len();
+    for snapshot in [0, 1] {
+        let folder = format!("snapshot_{snapshot:04}");
+        assert_eq!(names(&folder), ["error.npy", "manifest.json", "png", "stack.exr"]);
+        let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
+        let listed = app.get(&base).await.expect(200).json()["files"].clone();
+        let listed = listed.as_array().unwrap();
+        let manifest = app.get(&format!("{base}/exports/manifest")).await.expect(200).json();
+        assert_eq!(manifest["content"]["files"].as_array().unwrap().len(), listed.len() - 1);
+        for file in listed {
+            let (name, size) = (file["name"].as_str().unwrap(), file["size"].as_u64().unwrap());
+            let stored = results.join(&folder).join(name).metadata();
+            on_disk += stored.map_or(0, |stored| stored.len());
+            let path = format!("/v1/jobs/{job}/snapshots/{}", file["href"].as_str().unwrap());
+            let complete = app.get(&path).await.expect(200);
+            assert_eq!(json!(sha256(&complete.bytes)), file["sha256"], "{name}");
+            let etag = complete.header("etag").to_owned();
+            assert_eq!(etag, file["sha256"].to_string(), "{name}");
+            let head = app.send(app.request(Method::HEAD, &path)).await.expect(200);
+            let figures = (head.header("content-length"), head.header("etag"));
+            assert_eq!(figures, (&*size.to_string(), &*etag), "{name}");
+            let known = app.request(Method::GET, &path).header("if-none-match", &etag);
+            app.send(known).await.expect(304);
+            if name == "manifest.json" {
+                assert_eq!(complete.header("accept-ranges"), "none");
+                continue;
+            }
+            let recorded = json!({"name": name, "size": size, "sha256": file["sha256"]});
+            assert!(manifest["content"]["files"].as_array().unwrap().contains(&recorded), "{name}");
+            let mut joined = Vec::new();
+            while (joined.len() as u64) < size {
+                let range =
+                    format!("bytes={}-{}", joined.len(), joined.len() as u64 + size / 5 + 7);
+                let part = app.request(Method::GET, &path).header("range", range);
+                joined.extend(app.send(part.header("if-range", &etag)).await.expect(206).bytes);
+            }
+            assert!(joined == complete.bytes, "{name}");
+            let beyond = app.request(Method::GET, &path).header("range", format!("bytes={size}-"));
+            app.send(beyond).await.problem(416, "range_not_satisfiable");
+        }
+    }
+    // The lab is charged for the stored files alone.
+    assert_eq!(app.kept().await, on_disk);
 }
 
 /// Output of the movie judge for all movies of a job.
@@ -247,12 +306,12 @@ async fn a_movie_is_encoded_on_request_and_stored_like_a_result() {
     assert_eq!(app.movie(&path).await.expect(200).bytes, movie.bytes);
 
     // Damaged frames have no movie. The answer says so, and a retry of the job restores it.
-    let array = app.data().join("results").join(&job).join("snapshot_0000/frames.npy");
-    let original = std::fs::read(&array).unwrap();
-    std::fs::write(&array, &original[..original.len() - 1]).unwrap();
+    let stack = app.data().join("results").join(&job).join("snapshot_0000/stack.exr");
+    let original = std::fs::read(&stack).unwrap();
+    std::fs::write(&stack, &original[..original.len() - 1]).unwrap();
     app.create_movie(&job, None).await.expect(202);
     let detail = app.movie(&sequence).await.problem(500, "movie_failed");
-    assert!(detail.contains("frames.npy is damaged: retry the job"), "{detail}");
+    assert!(detail.contains("stack.exr is damaged: retry the job"), "{detail}");
     app.get(&sequence).await.problem(500, "movie_failed");
     app.create_movie(&job, None).await.expect(202);
     app.movie(&sequence).await.problem(500, "movie_failed");

@@ -234,8 +234,8 @@ const COPIES: [&str; 13] = [
      SELECT copies.job, cost, tiles_left, tiles_longest, others_left, others_longest, tiles_total,
          tiles_done, tile_seconds, tile_cost, prepared, previews_done, snapshots_done, iterations, passes
      FROM copies JOIN job_sums ON job_sums.job = original",
-    "INSERT INTO result_files (job, snapshot, name, size, sha256)
-     SELECT copies.job, snapshot, name, size, sha256
+    "INSERT INTO result_files (job, snapshot, name, size, sha256, crc32, derived)
+     SELECT copies.job, snapshot, name, size, sha256, crc32, derived
      FROM copies JOIN result_files ON result_files.job = original",
     "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)
      SELECT printf('%064x', n), 1000, iif(n % 2, 'upload', 'prepared'), created_at, touched_at

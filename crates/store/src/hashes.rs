@@ -6,7 +6,6 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Arc;
 
-use flate2::Crc;
 use quick_cache::sync::Cache;
 use sha2::Digest;
 use tokio::sync::Semaphore;
@@ -38,36 +37,10 @@ impl Identity {
     }
 }
 
-/// Checksums of a file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Digests {
-    pub(super) sha256: Sha256,
-    /// CRC-32, by which ZIP archives check their members.
-    pub(super) crc32: u32,
-}
-
-/// Digests in the making.
-#[derive(Debug, Default)]
-pub(super) struct Digester {
-    sha256: sha2::Sha256,
-    crc32: Crc,
-}
-
-impl Digester {
-    pub(super) fn update(&mut self, bytes: &[u8]) {
-        self.sha256.update(bytes);
-        self.crc32.update(bytes);
-    }
-
-    pub(super) fn finish(self) -> Digests {
-        Digests { sha256: Sha256::new(self.sha256.finalize().into()), crc32: self.crc32.sum() }
-    }
-}
-
-/// Digests of files that were written or read.
+/// Hashes of files that were written or read.
 #[derive(Debug)]
 pub(super) struct Hashes {
-    known: Cache<Identity, Digests>,
+    known: Cache<Identity, Sha256>,
     turns: Semaphore,
 }
 
@@ -78,14 +51,14 @@ impl Default for Hashes {
 }
 
 impl Hashes {
-    /// Remembers the digests of a file.
-    pub(super) fn remember(&self, file: Identity, digests: Digests) {
-        self.known.insert(file, digests);
+    /// Remembers the hash of a file.
+    pub(super) fn remember(&self, file: Identity, sha256: Sha256) {
+        self.known.insert(file, sha256);
     }
 
-    /// The digests of an open file. It is read once for all who ask, and to its end even if none of them waits any
+    /// The hash of an open file. It is read once for all who ask, and to its end even if none of them waits any
     /// longer.
-    pub(super) async fn of(self: &Arc<Self>, file: &File, meta: &Metadata) -> Result<Digests> {
+    pub(super) async fn of(self: &Arc<Self>, file: &File, meta: &Metadata) -> Result<Sha256> {
         let identity = Identity::of(meta);
         if let Some(known) = self.known.get(&identity) {
             return Ok(known);
@@ -99,12 +72,12 @@ impl Hashes {
         reading.await.map_err(|_| StoreError::Interrupted)?
     }
 
-    async fn read(&self, mut file: Hashing) -> Result<Digests> {
+    async fn read(&self, mut file: Hashing) -> Result<Sha256> {
         loop {
             let _turn = self.turns.acquire().await.map_err(|_| StoreError::Interrupted)?;
             let (read, count) = file.advance().await?;
             if count == 0 {
-                return Ok(read.digester.finish());
+                return Ok(read.finish());
             }
             file = read;
         }
@@ -115,13 +88,13 @@ impl Hashes {
 #[derive(Debug)]
 pub(super) struct Hashing {
     pub(super) file: File,
-    pub(super) digester: Digester,
+    hasher: sha2::Sha256,
     slice: Vec<u8>,
 }
 
 impl Hashing {
     pub(super) fn new(file: File) -> Self {
-        Self { file, digester: Digester::default(), slice: Vec::new() }
+        Self { file, hasher: sha2::Sha256::new(), slice: Vec::new() }
     }
 
     /// Reads the next slice. Gives its bytes, 0 at the end of the file.
@@ -129,10 +102,15 @@ impl Hashing {
         on_files(move || {
             self.slice.resize(SLICE, 0);
             let count = self.file.read(&mut self.slice).map_err(unreadable())?;
-            self.digester.update(&self.slice[..count]);
+            self.hasher.update(&self.slice[..count]);
             Ok((self, count))
         })
         .await
+    }
+
+    /// The hash of all slices that were read.
+    pub(super) fn finish(self) -> Sha256 {
+        Sha256::new(self.hasher.finalize().into())
     }
 }
 
@@ -150,13 +128,7 @@ pub(super) fn open(path: &Path) -> Result<Option<(File, Metadata)>> {
     Ok(Some((file, meta)))
 }
 
-/// The digests of the bytes that are left to read.
-pub(super) fn digest(mut file: File) -> Result<Digests> {
-    let (mut digester, mut slice) = (Digester::default(), vec![0; SLICE]);
-    loop {
-        match file.read(&mut slice).map_err(unreadable())? {
-            0 => return Ok(digester.finish()),
-            count => digester.update(&slice[..count]),
-        }
-    }
+/// The hash of the bytes that are left to read.
+pub(super) fn digest(mut file: File) -> Result<Sha256> {
+    Ok(Sha256::of_reader(&mut file).map_err(unreadable())?.0)
 }

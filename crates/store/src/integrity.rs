@@ -11,11 +11,11 @@ use std::time::Duration;
 use rustix::fs::{Advice, fadvise};
 
 use super::error::{Result, StoreError};
-use super::hashes::{Digests, Hashing, Identity, digest, open};
+use super::hashes::{Hashing, Identity, digest, open};
 use super::records::{self, Place, Record};
 use super::{DataDir, Job, Store, on_files};
 use crate::columns::{sql, sql_as};
-use engine::job::{ResultFile, Sha256, Timestamp};
+use engine::job::{ResultFile, Sha256, Timestamp, WrittenFile};
 
 /// Time from the begin of a slow look to that of the next.
 const ROUND: Duration = Duration::from_secs(86_400);
@@ -48,30 +48,27 @@ impl Audit {
 
 impl Store {
     /// Opens a result file of a snapshot (or, with none, of the whole job).
-    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet; [`StoreError::Damaged`] if it is
-    /// missing or damaged.
+    /// Errors: [`StoreError::NotFound`] if the job has not made it, or not yet, and for a derived file;
+    /// [`StoreError::Damaged`] if it is missing or damaged.
     pub async fn open_result(
         &self,
         job: &Job,
         snapshot: Option<u32>,
         name: &str,
     ) -> Result<(ResultFile, PathBuf, File)> {
-        let (file, path) = self.result_file(job, snapshot, name).await?;
-        let (opened, _) = self.open_intact(&result_record(job, snapshot, &file)).await?;
+        let (WrittenFile { file, is_derived, .. }, path) =
+            self.result_file(job, snapshot, name).await?;
+        if is_derived {
+            return Err(StoreError::missing("stored result file", name));
+        }
+        let opened = self.open_intact(&result_record(job, snapshot, &file)).await?;
         Ok((file, path, opened))
-    }
-
-    /// The CRC-32 of a result file of a snapshot (or, with none, of the whole job).
-    /// Errors: as [`Self::open_result`].
-    pub async fn result_crc32(&self, job: &Job, snapshot: Option<u32>, name: &str) -> Result<u32> {
-        let (file, _) = self.result_file(job, snapshot, name).await?;
-        Ok(self.open_intact(&result_record(job, snapshot, &file)).await?.1.crc32)
     }
 
     /// Opens a stored file, whose bytes are those of its name.
     /// Errors: [`StoreError::Damaged`] if it is missing or damaged.
     pub async fn open_blob(&self, sha256: Sha256) -> Result<File> {
-        Ok(self.open_intact(&Record { place: Place::Blob(sha256), sha256 }).await?.0)
+        self.open_intact(&Record { place: Place::Blob(sha256), sha256 }).await
     }
 
     /// Path of a stored file that has the hash in its name.
@@ -81,17 +78,17 @@ impl Store {
         Ok(self.dir().blob(&sha256))
     }
 
-    async fn open_intact(&self, record: &Record) -> Result<(File, Digests)> {
+    async fn open_intact(&self, record: &Record) -> Result<File> {
         let path = record.path(self.dir());
         let opened = on_files(move || open(&path)).await?;
         let Some((mut file, meta)) = opened else { return Err(self.damaged(record).await) };
         let found = self.hashes.of(&file, &meta).await?;
-        if found.sha256 != record.sha256 {
+        if found != record.sha256 {
             return Err(self.damaged(record).await);
         }
         on_files(move || {
             file.rewind().map_err(StoreError::io("read", Path::new("a stored file")))?;
-            Ok((file, found))
+            Ok(file)
         })
         .await
     }
@@ -167,7 +164,7 @@ impl Store {
                 let path = record.path(self.dir());
                 let found = on_files(move || {
                     let Some((file, meta)) = open(&path)? else { return Ok(None) };
-                    Ok(Some((digest(file)?.sha256, meta.len())))
+                    Ok(Some((digest(file)?, meta.len())))
                 })
                 .await?;
                 self.compare(&record, found, &mut audit).await?;
@@ -256,9 +253,9 @@ impl Store {
         let found = match opened {
             None => None,
             Some((file, meta)) => {
-                let digests = read_slowly(file, rate).await?;
-                self.hashes.remember(Identity::of(&meta), digests);
-                Some(digests.sha256)
+                let sha256 = read_slowly(file, rate).await?;
+                self.hashes.remember(Identity::of(&meta), sha256);
+                Some(sha256)
             }
         };
         if found != Some(record.sha256)
@@ -281,7 +278,7 @@ fn result_record(job: &Job, snapshot: Option<u32>, file: &ResultFile) -> Record 
 
 /// Hashes a file as it lies on the disk, not as the kernel remembers it, and stays below this rate. Between
 /// slices it can be broken off.
-async fn read_slowly(file: File, rate: u64) -> Result<Digests> {
+async fn read_slowly(file: File, rate: u64) -> Result<Sha256> {
     // Advice alone: where it is not taken, what the kernel remembers is hashed.
     let _ = fadvise(&file, 0, None, Advice::DontNeed);
     let mut hashing = Hashing::new(file);
@@ -295,14 +292,14 @@ async fn read_slowly(file: File, rate: u64) -> Result<Digests> {
         tokio::time::sleep(Duration::from_secs_f64(count as f64 / rate.max(1) as f64)).await;
     }
     let _ = fadvise(&hashing.file, 0, None, Advice::DontNeed);
-    Ok(hashing.digester.finish())
+    Ok(hashing.finish())
 }
 
 impl Record {
     /// True if the file at this path has the recorded hash.
     pub(super) fn is_at(&self, dir: &DataDir) -> Result<bool> {
         match open(&self.path(dir))? {
-            Some((file, _)) => Ok(digest(file)?.sha256 == self.sha256),
+            Some((file, _)) => Ok(digest(file)? == self.sha256),
             None => Ok(false),
         }
     }

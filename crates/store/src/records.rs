@@ -92,7 +92,7 @@ pub(super) async fn page(
     };
     let results: Vec<ResultRow> = sql_as!(
         "SELECT job, snapshot, name, sha256 FROM result_files
-         WHERE (job, snapshot, name) > (?, ?, ?) ORDER BY job, snapshot, name LIMIT ?",
+         WHERE (job, snapshot, name) > (?, ?, ?) AND NOT derived ORDER BY job, snapshot, name LIMIT ?",
         [job, snapshot, name, PAGE]
     )
     .fetch_all(connection)

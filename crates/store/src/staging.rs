@@ -7,14 +7,15 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use sha2::Digest;
 use uuid::Uuid;
 
 use super::Store;
 use super::error::{Result, StoreError};
-use super::hashes::{Digester, Digests, Identity, digest};
+use super::hashes::{Identity, digest};
 use super::locked::LockedFile;
 use super::{DataDir, dir, on_files, upgrade};
-use engine::job::{ResultFile, Sha256, Timestamp};
+use engine::job::{Sha256, Timestamp, WrittenFile};
 
 /// A temporary file or folder; its lock and its removal.
 #[derive(Debug)]
@@ -54,7 +55,7 @@ impl Store {
         let file = File::options().write(true).open(path);
         let file = file.map_err(StoreError::io("open", path))?;
         let file = BufWriter::with_capacity(256 * 1024, file);
-        Ok(BlobWriter { file, temporary: staged.0, digester: Digester::default(), size: 0 })
+        Ok(BlobWriter { file, temporary: staged.0, hasher: sha2::Sha256::new(), size: 0 })
     }
 
     /// A new empty file for a writer that wants a path. Blocks on the disk.
@@ -124,7 +125,7 @@ fn keep(root: &DataDir, place: &Path, since: Option<Timestamp>) -> Result<bool> 
 pub struct BlobWriter {
     temporary: Temporary,
     file: BufWriter<File>,
-    digester: Digester,
+    hasher: sha2::Sha256,
     size: u64,
 }
 
@@ -137,15 +138,15 @@ impl BlobWriter {
     pub fn finish(mut self) -> Result<StagedBlob> {
         let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
         synced.map_err(StoreError::io("write to the disk", &self.temporary.path))?;
-        let digests = self.digester.finish();
-        Ok(StagedBlob { temporary: self.temporary, digests, size: self.size })
+        let sha256 = Sha256::new(self.hasher.finalize().into());
+        Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
     }
 }
 
 impl Write for BlobWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let count = self.file.write(bytes)?;
-        self.digester.update(&bytes[..count]);
+        self.hasher.update(&bytes[..count]);
         self.size += count as u64;
         Ok(count)
     }
@@ -171,7 +172,7 @@ impl StagedPath {
         let file = File::open(path).map_err(StoreError::io("open", path))?;
         let size = file.metadata().map_err(StoreError::io("read", path))?.len();
         file.sync_all().map_err(StoreError::io("write to the disk", path))?;
-        Ok(StagedBlob { temporary: self.0, digests: digest(file)?, size })
+        Ok(StagedBlob { temporary: self.0, sha256: digest(file)?, size })
     }
 }
 
@@ -179,17 +180,13 @@ impl StagedPath {
 #[derive(Debug)]
 pub struct StagedBlob {
     temporary: Temporary,
-    digests: Digests,
+    sha256: Sha256,
     size: u64,
 }
 
 impl StagedBlob {
     pub fn sha256(&self) -> Sha256 {
-        self.digests.sha256
-    }
-
-    pub(super) fn digests(&self) -> Digests {
-        self.digests
+        self.sha256
     }
 
     pub fn size(&self) -> u64 {
@@ -245,8 +242,8 @@ impl StagedDir {
     }
 
     /// Moves the files, not the folder, into the folder `place`. The writer's lock must be held.
-    pub(super) fn put_files(self, place: &Path, files: &[ResultFile]) -> Result<()> {
-        for file in files {
+    pub(super) fn put_files(self, place: &Path, files: &[WrittenFile]) -> Result<()> {
+        for WrittenFile { file, .. } in files {
             dir::rename_durably(&self.0.path.join(&file.name), &place.join(&file.name))?;
         }
         Ok(())

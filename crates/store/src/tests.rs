@@ -29,6 +29,7 @@ use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
     MeasurementId, MeasurementRequest, Reading, ResultFile, ScaleBasis, Sequence, Sha256,
     SnapshotSelection, Submission, TaskKind, TaskProgress, ThingId, TileSpec, WorkerId,
+    WrittenFile,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -41,10 +42,11 @@ impl ClaimedTask {
     }
 }
 
-fn file(folder: &StagedDir, name: &str, content: &str) -> ResultFile {
+fn file(folder: &StagedDir, name: &str, content: &str) -> WrittenFile {
     std::fs::write(folder.path().join(name), content).unwrap();
     let sha256 = Sha256::of(content.as_bytes());
-    ResultFile { name: name.into(), size: content.len() as u64, sha256 }
+    let file = ResultFile { name: name.into(), size: content.len() as u64, sha256 };
+    WrittenFile { file, crc32: 0, is_derived: false }
 }
 
 struct Lab {
@@ -214,10 +216,13 @@ impl Lab {
             TaskKind::Tile { snapshot, tile, .. } => self.blob(&format!("{snapshot} {tile}")),
             TaskKind::Assemble { .. } => {
                 let folder = self.store.staged_dir().unwrap();
-                std::fs::create_dir(folder.path().join("frames")).unwrap();
-                let frame = file(&folder, "frames/frame_0001.exr", "pixels");
-                let array = file(&folder, "frames.npy", "pixels");
-                Product::Files(folder, vec![frame, array])
+                std::fs::create_dir(folder.path().join("png")).unwrap();
+                let picture = file(&folder, "png/frame_0001.png", "pixels");
+                let stack = file(&folder, "stack.exr", "pixels");
+                let sha256 = Sha256::of(b"array");
+                let array = ResultFile { name: "frames.npy".into(), size: 1 << 40, sha256 };
+                let array = WrittenFile { file: array, crc32: 1, is_derived: true };
+                Product::Files(folder, vec![picture, stack, array])
             }
             TaskKind::Movie { snapshot } | TaskKind::Gif { snapshot } => {
                 self.blob(&format!("movie {snapshot:?}"))
@@ -334,9 +339,16 @@ async fn a_job_runs_in_order_and_leaves_its_results_and_no_tiles() {
     let done = lab.store.job(&engine::job::Lab::local(), job).await.unwrap();
     assert_eq!(done.state, JobState::Succeeded);
     assert!(done.finished_at >= done.started_at);
-    let (file, path) =
-        lab.store.result_file(&done, Some(1), "frames/frame_0001.exr").await.unwrap();
-    assert_eq!(Sha256::of(&std::fs::read(path).unwrap()), file.sha256);
+    let (picture, path) =
+        lab.store.result_file(&done, Some(1), "png/frame_0001.png").await.unwrap();
+    assert_eq!(Sha256::of(&std::fs::read(path).unwrap()), picture.file.sha256);
+    // A derived file has a record, takes no room, and is not expected on the disk.
+    let (array, _) = lab.store.result_file(&done, Some(1), "frames.npy").await.unwrap();
+    assert!(array.is_derived);
+    assert!(lab.store.open_result(&done, Some(1), "frames.npy").await.is_err());
+    assert!(lab.store.verify().await.unwrap().is_good());
+    let used = lab.store.lab_use(&engine::job::Lab::local()).await.unwrap();
+    assert!(used.result_bytes < 1 << 10, "{}", used.result_bytes);
     assert!(lab.store.result_file(&done, None, "manifest.json").await.unwrap().1.exists());
     let progress = lab.store.progress(&done).await.unwrap();
     assert_eq!((progress.percent, progress.tiles_done, progress.snapshots_done), (100.0, 4, 2));

@@ -315,7 +315,7 @@ fn white_level(record: &Value) -> Result<f32, PipelineError> {
 }
 
 fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
-    let MovieWork { spec, format, measurement, white, window, arrays, .. } = work;
+    let MovieWork { spec, format, measurement, white, window, clips, .. } = work;
     let window = match window {
         Some(window) => parsed("movie", window)?,
         None => DisplayWindow {
@@ -335,7 +335,7 @@ fn movie_task(work: &MovieWork) -> Result<MovieTask, PipelineError> {
         window,
         requested: work.window.is_some(),
         scene_fps: exposure.map(|seconds| 1.0 / seconds),
-        clips: arrays.clone(),
+        clips: clips.clone(),
     })
 }
 

@@ -26,7 +26,7 @@ use engine::pipeline::records::{
 use engine::pipeline::scale::Histogram;
 use engine::pipeline::tile::{reconstruct_tile, run_network};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
-use engine::pipeline::write::{write_manifest, write_result};
+use engine::pipeline::write::{OnDisk, write_manifest, write_result};
 use engine::pipeline::{movie, preview, registration, scale};
 use formats::planar::{self, Reader};
 use formats::{Limits, StackInfo};
@@ -104,13 +104,14 @@ pub(super) fn perform(
             let manifest =
                 recipe.snapshot(snapshot as usize, records, assessment.clone(), run.clone());
             let summary = manifest.content.summary.clone();
-            let files = write_result(folder.path(), manifest, error, |k| {
+            let files = write_result(folder.path(), manifest, error, OnDisk::Stored, |k| {
                 monitor.check()?;
                 monitor.reach(TaskStage::Writing, k as f64 / recipe.shape.frames as f64);
                 Ok(blend::stored_frame(&recipe.tile_plan, &shares, k)?)
             })?;
             monitor.reach(TaskStage::Writing, 1.0);
-            let record = SnapshotRecord { summary, assessment, run, files: files.clone() };
+            let listed = files.iter().map(|file| file.file.clone()).collect();
+            let record = SnapshotRecord { summary, assessment, run, files: listed };
             (json(&record)?, Output::Files(folder, files))
         }
         TaskInput::Manifest { job, spec, recipe, tasks, folder } => {

@@ -13,8 +13,8 @@ use tokio::runtime::Handle;
 
 use engine::intake::{CaptureFiles, IntakeError};
 use engine::job::{
-    JobId, JobSpec, Mosaic, RegistrationRequest, ResultFile, SceneShape, Schedule, Sha256,
-    SnapshotRange, TaskProgress,
+    JobId, JobSpec, Mosaic, RegistrationRequest, SceneShape, Schedule, Sha256, SnapshotRange,
+    TaskProgress, WrittenFile,
 };
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
@@ -228,7 +228,7 @@ pub enum Output {
     /// The file of a movie.
     File(StagedPath),
     /// Files of a result, and their folder.
-    Files(StagedDir, Vec<ResultFile>),
+    Files(StagedDir, Vec<WrittenFile>),
     Checked(Box<Checked>),
     /// The report on a calibration, and its masks if they were made from captures.
     Calibration(Box<CalibrationDone>),

@@ -9,7 +9,8 @@ use axum::response::Response;
 use super::super::error::Result;
 use super::super::results::{attachment, result_file};
 use super::clip::Clip;
-use super::composed::{Composed, Content, Framing, Part, Section, Source};
+use super::composed::{Composed, Content, Framing, Part, Source};
+use engine::pipeline::derived::STACK;
 
 /// Version 4.5 of the specification (APPNOTE 4.4.3), the first with files above 4 GiB.
 const VERSION: u16 = 45;
@@ -28,30 +29,37 @@ const LOCATOR_64: u32 = 0x0706_4b50;
 
 /// `zip`: an archive of all results of a job.
 pub(super) async fn archive(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
-    let Clip { app, job, .. } = clip;
     // A job writes the manifest last: if it is missing, the results are incomplete.
-    let (manifest, _) = result_file(&app, &job, None, "manifest.json").await?;
+    let (manifest, _) = result_file(&clip.app, &clip.job, None, "manifest.json").await?;
     let mut members = Vec::new();
-    for snapshot in job.spec.snapshots.indices() {
-        for file in app.store.result_files(&job, Some(snapshot)).await? {
-            let name = format!("snapshot_{snapshot:04}/{}", file.name);
-            let source = Source { snapshot: Some(snapshot), file };
-            members.push((name, Content::File(Section::whole(source))));
+    for snapshot in clip.job.spec.snapshots.indices() {
+        let files = clip.app.store.result_files(&clip.job, Some(snapshot)).await?;
+        let stack = files.iter().find(|file| file.file.name == STACK);
+        let stack = stack.map(|it| Source { snapshot: Some(snapshot), file: it.file.clone() });
+        for file in files {
+            let name = format!("snapshot_{snapshot:04}/{}", file.file.name);
+            members.push((name, clip.content(Some(snapshot), file, stack.as_ref())?));
         }
     }
-    let name = manifest.name.clone();
-    let source = Source { snapshot: None, file: manifest };
-    members.push((name, Content::File(Section::whole(source))));
-    let disposition = attachment(job.id, None, "results.zip");
-    let composed = Composed { parts: parts(members), kind: "application/zip", disposition };
-    composed.send(&app, job, request).await
+    members.push((manifest.file.name.clone(), clip.content(None, manifest, None)?));
+    send(clip, members, "results.zip", request).await
 }
 
 /// `zarr_zip`: the OME-Zarr group as one file.
 pub(super) async fn zarr(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
-    let disposition = attachment(clip.job.id, clip.snapshot, "frames.zarr.zip");
-    let parts = parts(clip.zarr_files().await?);
-    let composed = Composed { parts, kind: "application/zip", disposition };
+    let files = clip.zarr_files().await?;
+    send(clip, files, "frames.zarr.zip", request).await
+}
+
+async fn send(
+    clip: Clip,
+    files: Vec<(String, Content)>,
+    name: &str,
+    request: (&Method, &HeaderMap),
+) -> Result<Response> {
+    let disposition = attachment(clip.job.id, clip.snapshot, name);
+    let (parts, kind) = (parts(files), "application/zip");
+    let composed = Composed { parts, sha256: None, kind, disposition };
     composed.send(&clip.app, clip.job, request).await
 }
 
@@ -78,7 +86,7 @@ fn parts(files: Vec<(String, Content)>) -> Vec<Part> {
         members.push(member.clone());
         let make: Framing = Arc::new(move |sums: &[u32]| member.local_header(sums[0]));
         parts.push(Part::Framing { contents: [content.clone()].into(), length, make });
-        parts.push(Part::Content(content));
+        parts.extend(content.pieces.into_iter().map(Part::Piece));
     }
     let length = directory(&members, &vec![0; members.len()], offset).len() as u64;
     let make: Framing = Arc::new(move |sums: &[u32]| directory(&members, sums, offset));
@@ -189,14 +197,16 @@ mod tests {
 
     use flate2::Crc;
 
-    use super::{Content, Part, Section, Source, parts};
+    use super::super::composed::{Piece, Section, Source};
+    use super::{Content, Part, parts};
     use engine::job::{ResultFile, Sha256};
 
     fn files(sizes: &[u64]) -> Vec<(String, Content)> {
         let file = |(index, size): (usize, &u64)| {
             let name = format!("file_{index}");
             let file = ResultFile { name: name.clone(), size: *size, sha256: Sha256::of(b"") };
-            (name, Content::File(Section::whole(Source { snapshot: None, file })))
+            let piece = Piece::File(Section::whole(Source { snapshot: None, file }));
+            (name, Content { pieces: vec![piece], crc32: None })
         };
         sizes.iter().enumerate().map(file).collect()
     }

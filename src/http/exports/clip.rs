@@ -1,5 +1,8 @@
-//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, NPY and OME-Zarr. These exports are composed of
-//! the raw frames in `frames.npy`.
+//! The frames of a snapshot, or of all snapshots of a job in order, as TIFF, NPY, OME-Zarr and single EXR frames. All are
+//! composed of the lines of the stored stacks.
+
+use std::ops::Range;
+use std::sync::Arc;
 
 use axum::body::Bytes;
 use axum::extract::FromRequestParts;
@@ -14,15 +17,17 @@ use super::super::conditional;
 use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Caller, Params, canonical_number};
 use super::super::jobs::with_snapshot;
-use super::super::results::{attachment, result_file};
-use super::composed::{Composed, Content, Part, Section, Source};
+use super::super::results::{attachment, file_name, media_type, result_file};
+use super::composed::{Composed, Content, Part, Piece, Section, Source};
 use super::format::Format;
-use engine::job::JobId;
+use super::lines::{Compose, Lines};
+use engine::job::{JobId, WrittenFile};
+use engine::pipeline::derived::{Derived, STACK};
 use engine::pipeline::manifest::CameraRecord;
+use formats::exr;
 use formats::{Channels, clip_tiff, npy};
 use store::Job;
 
-const ARRAY: &str = "frames.npy";
 /// Metadata of the Zarr group, and of its only array.
 const GROUP: &str = "zarr.json";
 const ARRAY_METADATA: &str = "0/zarr.json";
@@ -79,7 +84,7 @@ pub(super) async fn tiff(clip: Clip, request: (&Method, &HeaderMap)) -> Result<R
 /// `npy`: the frames of all snapshots as one array.
 pub(super) async fn array(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let head = npy::stack_header(clip.shape(), clip.channels());
-    clip.send_with_head(head, "application/octet-stream", ARRAY, request).await
+    clip.send_with_head(head, "application/octet-stream", "frames.npy", request).await
 }
 
 /// `zarr`: a file of the OME-Zarr group.
@@ -88,15 +93,38 @@ pub(super) async fn zarr(
     path: &str,
     request: (&Method, &HeaderMap),
 ) -> Result<Response> {
-    let content = match path {
+    let chunk = match path {
         GROUP => return conditional::json(&clip.zarr_group().await?, request.1),
         ARRAY_METADATA => return conditional::json(&clip.zarr_array().await?, request.1),
         chunk => clip.chunk(chunk).await?,
     };
     let composed = Composed {
-        parts: vec![Part::Content(Content::File(content))],
+        parts: vec![Part::Piece(chunk)],
+        sha256: None,
         kind: "application/octet-stream",
         disposition: "inline".into(),
+    };
+    composed.send(&clip.app, clip.job, request).await
+}
+
+/// Sends a result file, stored or derived.
+pub(super) async fn result(
+    clip: Clip,
+    name: &str,
+    request: (&Method, &HeaderMap),
+) -> Result<Response> {
+    let (file, _) = result_file(&clip.app, &clip.job, clip.snapshot, name).await?;
+    let sha256 = Some(file.file.sha256);
+    let stack = match clip.snapshot.filter(|_| file.is_derived) {
+        Some(snapshot) => Some(clip.source(snapshot).await?),
+        None => None,
+    };
+    let pieces = clip.content(clip.snapshot, file, stack.as_ref())?.pieces;
+    let composed = Composed {
+        parts: pieces.into_iter().map(Part::Piece).collect(),
+        sha256,
+        kind: media_type(name),
+        disposition: format!("inline; {}", file_name(clip.job.id, clip.snapshot, name)),
     };
     composed.send(&clip.app, clip.job, request).await
 }
@@ -127,15 +155,10 @@ impl Clip {
         self.job.spec.shape.channels()
     }
 
-    fn frame_bytes(&self) -> u64 {
-        let shape = self.job.spec.frame_shape();
-        (shape.height * shape.width * self.channels().count() * size_of::<f32>()) as u64
-    }
-
-    /// The raw frames of a snapshot.
+    /// The stored frames of a snapshot.
     async fn source(&self, snapshot: u32) -> Result<Source> {
-        let (file, _) = result_file(&self.app, &self.job, Some(snapshot), ARRAY).await?;
-        Ok(Source { snapshot: Some(snapshot), file })
+        let (stack, _) = result_file(&self.app, &self.job, Some(snapshot), STACK).await?;
+        Ok(Source { snapshot: Some(snapshot), file: stack.file })
     }
 
     pub(super) async fn sources(&self) -> Result<Vec<Source>> {
@@ -146,26 +169,73 @@ impl Clip {
         Ok(sources)
     }
 
-    /// Offset of the frames in the file of a snapshot.
-    fn start(&self, source: &Source) -> Result<u64> {
-        values_offset(source, self.job.spec.shape.frames as u64 * self.frame_bytes())
+    /// The content of a result file of a snapshot (or, with none, of the whole job). A derived file needs the stack.
+    pub(super) fn content(
+        &self,
+        snapshot: Option<u32>,
+        WrittenFile { file, crc32, is_derived }: WrittenFile,
+        stack: Option<&Source>,
+    ) -> Result<Content> {
+        let shape = self.job.spec.frame_shape();
+        let derived = Derived::named(&file.name, shape).filter(|_| is_derived);
+        let pieces = match (derived, stack) {
+            (Some(derived), Some(source)) => {
+                let lines = self.derived(source, derived, derived.frames(shape.frames))?;
+                let length = values_offset(file.size, lines.length())?;
+                let make = Arc::new(move |stack: &exr::Stack| derived.head(stack));
+                vec![Piece::Head { source: source.clone(), shape, length, make }, lines]
+            }
+            _ => vec![Piece::File(Section::whole(Source { snapshot, file }))],
+        };
+        Ok(Content { pieces, crc32: Some(crc32) })
+    }
+
+    /// The lines of a derived file that belong to these frames of a snapshot.
+    fn derived(&self, source: &Source, derived: Derived, frames: Range<usize>) -> Result<Piece> {
+        let (stored, height) = (self.stored_lines(), self.job.spec.frame_shape().height);
+        let compose: Compose = Arc::new(move |_, number, line, composed| {
+            derived.line(stored, number % height, line, composed);
+        });
+        self.lines(source, frames, None, (derived.line_bytes(stored), compose))
+    }
+
+    /// The layout of the lines in a stored stack.
+    fn stored_lines(&self) -> exr::Lines {
+        let shape = self.job.spec.frame_shape();
+        exr::Lines::new(shape.frames, shape.width, shape.channels())
+    }
+
+    /// The lines of some frames of a snapshot, each composed into this number of bytes.
+    pub(super) fn lines(
+        &self,
+        source: &Source,
+        frames: Range<usize>,
+        shared: Option<Section>,
+        (composed_bytes, compose): (usize, Compose),
+    ) -> Result<Piece> {
+        let shape = self.job.spec.frame_shape();
+        let stored_bytes = self.stored_lines().stored_bytes() as u64;
+        let bytes = |frames: usize| (frames * shape.height) as u64 * stored_bytes;
+        let start = values_offset(source.file.size, bytes(shape.frames))? + bytes(frames.start);
+        let count = (frames.len() * shape.height) as u64;
+        let composed_bytes = composed_bytes as u64;
+        let lines = Lines { start, count, stored_bytes, composed_bytes, compose };
+        Ok(Piece::Lines { source: source.clone(), shared, lines })
     }
 
     /// All files of the OME-Zarr group, with their paths in it.
     pub(super) async fn zarr_files(&self) -> Result<Vec<(String, Content)>> {
-        let json = |value: Value| Content::Bytes(Bytes::from(value.to_string()));
+        let content = |piece| Content { pieces: vec![piece], crc32: None };
+        let json = |value: Value| content(Piece::Bytes(Bytes::from(value.to_string())));
         let mut files = vec![
             (GROUP.to_owned(), json(self.zarr_group().await?)),
             (ARRAY_METADATA.to_owned(), json(self.zarr_array().await?)),
         ];
-        let (length, frames) = (self.frame_bytes(), self.job.spec.shape.frames);
+        let frames = self.job.spec.shape.frames;
         for (index, source) in self.sources().await?.into_iter().enumerate() {
-            let start = self.start(&source)?;
             for k in 0..frames {
                 let name = format!("0/c/{}{}", index * frames + k, self.chunk_suffix());
-                let start = start + k as u64 * length;
-                let section = Section { source: source.clone(), start, length };
-                files.push((name, Content::File(section)));
+                files.push((name, content(self.derived(&source, Derived::Array, k..k + 1)?)));
             }
         }
         Ok(files)
@@ -259,7 +329,7 @@ impl Clip {
     }
 
     /// The chunk at this path: a frame, counted from 0.
-    async fn chunk(&self, path: &str) -> Result<Section> {
+    async fn chunk(&self, path: &str) -> Result<Piece> {
         let (frames, ..) = self.shape();
         let suffix = self.chunk_suffix();
         let number = path.strip_prefix("0/c/").and_then(|rest| rest.strip_suffix(suffix));
@@ -275,9 +345,8 @@ impl Clip {
         let first = self.snapshot.unwrap_or(self.job.spec.snapshots.first);
         let snapshot = first + u32::try_from(frame / per_snapshot).unwrap_or(u32::MAX);
         let source = self.source(snapshot).await?;
-        let length = self.frame_bytes();
-        let start = self.start(&source)? + (frame % per_snapshot) as u64 * length;
-        Ok(Section { source, start, length })
+        let k = frame % per_snapshot;
+        self.derived(&source, Derived::Array, k..k + 1)
     }
 
     /// Answers with a file of these first bytes and all frames.
@@ -288,14 +357,13 @@ impl Clip {
         name: &str,
         request: (&Method, &HeaderMap),
     ) -> Result<Response> {
-        let mut parts = vec![Part::Content(Content::Bytes(Bytes::from(head)))];
+        let mut parts = vec![Part::Piece(Piece::Bytes(Bytes::from(head)))];
         for source in self.sources().await? {
-            let start = self.start(&source)?;
-            let length = source.file.size - start;
-            parts.push(Part::Content(Content::File(Section { source, start, length })));
+            let frames = 0..self.job.spec.shape.frames;
+            parts.push(Part::Piece(self.derived(&source, Derived::Array, frames)?));
         }
         let disposition = attachment(self.job.id, self.snapshot, name);
-        Composed { parts, kind, disposition }.send(&self.app, self.job, request).await
+        Composed { parts, sha256: None, kind, disposition }.send(&self.app, self.job, request).await
     }
 
     async fn times(&self) -> Result<Times> {
@@ -327,10 +395,10 @@ impl Clip {
     }
 }
 
-/// Offset of the values in the file of an array. `values` is their length in bytes; they end the file.
-pub(super) fn values_offset(source: &Source, values: u64) -> Result<u64> {
-    source.file.size.checked_sub(values).ok_or_else(|| {
-        ApiError::internal(&std::io::Error::other("an array has fewer frames than its job"))
+/// Offset of the values in a file of this size. `values` is their length in bytes; they end the file.
+pub(super) fn values_offset(size: u64, values: u64) -> Result<u64> {
+    size.checked_sub(values).ok_or_else(|| {
+        ApiError::internal(&std::io::Error::other("a file has fewer frames than its job"))
     })
 }
 

@@ -1,8 +1,8 @@
-//! Files that are composed of result files while a client reads them, and are never stored. Their bytes depend only on
-//! the results, so a client can resume a download that broke off.
+//! Files that are composed of result files while a client reads them. Their bytes depend only on the results, so a client
+//! can resume a download that broke off.
 
 use std::fmt;
-use std::io;
+use std::io::{self, BufReader};
 use std::sync::Arc;
 
 use axum::body::{Body, Bytes};
@@ -13,13 +13,16 @@ use futures_util::stream::{self, BoxStream, StreamExt, TryStreamExt};
 use sha2::Digest;
 use tokio::fs::File;
 use tokio::io::Take;
+use tokio::task::JoinError;
 use tokio_util::io::ReaderStream;
 
 use super::super::app::App;
 use super::super::download::{self, Download};
 use super::super::error::{ApiError, Result};
 use super::lines::Lines;
-use engine::job::{ResultFile, Sha256};
+use engine::job::{ResultFile, SceneShape, Sha256};
+use formats::FormatError;
+use formats::exr::Stack;
 use store::{Job, StoreError};
 
 /// A result file that an export reads. `snapshot` is `None` for a file of the whole job.
@@ -37,11 +40,35 @@ pub(super) struct Section {
     pub(super) length: u64,
 }
 
-/// Bytes that exist before a client reads them.
-#[derive(Debug, Clone)]
-pub(super) enum Content {
+/// Makes the head of a derived file from that of the stack.
+pub(super) type MakeHead = Arc<dyn Fn(&Stack) -> Vec<u8> + Send + Sync>;
+
+/// Bytes that exist, or are derived from the stack of frames, when a client reads them.
+#[derive(Clone)]
+pub(super) enum Piece {
     Bytes(Bytes),
     File(Section),
+    /// The `length` bytes before the lines of a derived file.
+    Head {
+        source: Source,
+        shape: SceneShape,
+        length: u64,
+        make: MakeHead,
+    },
+    /// Lines of a result file, each composed with bytes that all lines share.
+    Lines {
+        source: Source,
+        shared: Option<Section>,
+        lines: Lines,
+    },
+}
+
+/// A file as an export or an archive offers it.
+#[derive(Clone)]
+pub(super) struct Content {
+    pub(super) pieces: Vec<Piece>,
+    /// The recorded CRC-32; `None` for content without a record.
+    pub(super) crc32: Option<u32>,
 }
 
 /// Composes the bytes between contents, such as headers of an archive, from the CRC-32 of the contents.
@@ -49,18 +76,12 @@ pub(super) type Framing = Arc<dyn Fn(&[u32]) -> Vec<u8> + Send + Sync>;
 
 #[derive(Clone)]
 pub(super) enum Part {
-    Content(Content),
+    Piece(Piece),
     /// `length` bytes, which `make` composes from the CRC-32 of the contents.
     Framing {
         contents: Arc<[Content]>,
         length: u64,
         make: Framing,
-    },
-    /// Lines of a result file, each composed with bytes that all lines share.
-    Lines {
-        source: Source,
-        shared: Section,
-        lines: Lines,
     },
 }
 
@@ -73,32 +94,27 @@ impl fmt::Debug for Part {
 impl Part {
     pub(super) fn length(&self) -> u64 {
         match self {
-            Self::Content(content) => content.length(),
+            Self::Piece(piece) => piece.length(),
             Self::Framing { length, .. } => *length,
-            Self::Lines { lines, .. } => lines.length(),
         }
     }
 
     /// The result files whose bytes are in the part.
     fn sources(&self) -> Vec<&Source> {
         match self {
-            Self::Content(Content::Bytes(_)) | Self::Framing { .. } => Vec::new(),
-            Self::Content(Content::File(section)) => vec![&section.source],
-            Self::Lines { source, shared, .. } => vec![source, &shared.source],
+            Self::Piece(piece) => piece.sources(),
+            Self::Framing { .. } => Vec::new(),
         }
     }
 
     /// Adds everything that determines the bytes to a hash.
     fn hash_inputs(&self, hasher: &mut sha2::Sha256) {
         match self {
-            Self::Content(content) => content.hash_inputs(hasher),
+            Self::Piece(piece) => piece.hash_inputs(hasher),
             Self::Framing { contents, length, .. } => {
                 hasher.update(format!("framing {length}\n"));
-                contents.iter().for_each(|content| content.hash_inputs(hasher));
-            }
-            Self::Lines { source, shared, lines } => {
-                hasher.update(format!("{lines:?} {} {}\n", lines.start, source.file.sha256));
-                shared.hash_inputs(hasher);
+                let pieces = contents.iter().flat_map(|content| &content.pieces);
+                pieces.for_each(|piece| piece.hash_inputs(hasher));
             }
         }
     }
@@ -106,11 +122,7 @@ impl Part {
     /// Reads `take` bytes of the part after the first `skip` bytes.
     async fn read(self, app: App, job: Arc<Job>, skip: u64, take: u64) -> io::Result<ByteStream> {
         match self {
-            Self::Content(Content::Bytes(bytes)) => Ok(slice_stream(&bytes, skip, take)),
-            Self::Content(Content::File(Section { source, start, .. })) => {
-                let section = Section { source, start: start + skip, length: take };
-                Ok(section.read(&app, &job).await?.boxed())
-            }
+            Self::Piece(piece) => piece.read(&app, &job, skip, take).await,
             Self::Framing { contents, length, make } => {
                 let mut sums = Vec::with_capacity(contents.len());
                 for content in contents.iter() {
@@ -120,20 +132,48 @@ impl Part {
                 debug_assert_eq!(bytes.len() as u64, length);
                 Ok(slice_stream(&bytes, skip, take))
             }
-            Self::Lines { source, shared, lines } => {
-                let shared: Vec<Bytes> = shared.read(&app, &job).await?.try_collect().await?;
-                let file = open(&app, &job, &source).await.map_err(abort)?;
-                Ok(lines.read(file, shared.concat().into(), skip, take).await?.boxed())
-            }
         }
     }
 }
 
 impl Content {
     pub(super) fn length(&self) -> u64 {
+        self.pieces.iter().map(Piece::length).sum()
+    }
+
+    async fn crc32(&self, app: &App, job: &Job) -> io::Result<u32> {
+        if let Some(sum) = self.crc32 {
+            return Ok(sum);
+        }
+        let mut crc = Crc::new();
+        for piece in &self.pieces {
+            let mut bytes = piece.clone().read(app, job, 0, piece.length()).await?;
+            while let Some(bytes) = bytes.try_next().await? {
+                crc.update(&bytes);
+            }
+        }
+        Ok(crc.sum())
+    }
+}
+
+impl Piece {
+    pub(super) fn length(&self) -> u64 {
         match self {
             Self::Bytes(bytes) => bytes.len() as u64,
             Self::File(section) => section.length,
+            Self::Head { length, .. } => *length,
+            Self::Lines { lines, .. } => lines.length(),
+        }
+    }
+
+    fn sources(&self) -> Vec<&Source> {
+        match self {
+            Self::Bytes(_) => Vec::new(),
+            Self::File(section) => vec![&section.source],
+            Self::Head { source, .. } => vec![source],
+            Self::Lines { source, shared, .. } => {
+                [source].into_iter().chain(shared.as_ref().map(|shared| &shared.source)).collect()
+            }
         }
     }
 
@@ -144,26 +184,40 @@ impl Content {
                 hasher.update(bytes);
             }
             Self::File(section) => section.hash_inputs(hasher),
+            Self::Head { source, length, .. } => {
+                hasher.update(format!("head {length} {}\n", source.file.sha256));
+            }
+            Self::Lines { source, shared, lines } => {
+                hasher.update(format!("{lines:?} {} {}\n", lines.start, source.file.sha256));
+                shared.iter().for_each(|shared| shared.hash_inputs(hasher));
+            }
         }
     }
 
-    async fn crc32(&self, app: &App, job: &Job) -> io::Result<u32> {
-        let mut crc = Crc::new();
+    /// Reads `take` bytes of the piece after the first `skip` bytes.
+    async fn read(self, app: &App, job: &Job, skip: u64, take: u64) -> io::Result<ByteStream> {
         match self {
-            Self::Bytes(bytes) => crc.update(bytes),
-            // The store remembers the sums of whole files.
-            Self::File(Section { source, start: 0, length }) if *length == source.file.size => {
-                let sum = app.store.result_crc32(job, source.snapshot, &source.file.name).await;
-                return sum.map_err(abort);
+            Self::Bytes(bytes) => Ok(slice_stream(&bytes, skip, take)),
+            Self::File(Section { source, start, .. }) => {
+                let section = Section { source, start: start + skip, length: take };
+                Ok(section.read(app, job).await?.boxed())
             }
-            Self::File(section) => {
-                let mut bytes = section.read(app, job).await?;
-                while let Some(piece) = bytes.try_next().await? {
-                    crc.update(&piece);
-                }
+            Self::Head { source, shape, length, make } => {
+                let stack = open(app, job, &source).await.map_err(abort)?;
+                let stack = read_stack(stack, shape).await.map_err(io::Error::other)?;
+                let bytes = Bytes::from(make(&stack));
+                debug_assert_eq!(bytes.len() as u64, length);
+                Ok(slice_stream(&bytes, skip, take))
+            }
+            Self::Lines { source, shared, lines } => {
+                let shared = match shared {
+                    Some(section) => section.read(app, job).await?.try_collect().await?,
+                    None => Vec::<Bytes>::new(),
+                };
+                let file = open(app, job, &source).await.map_err(abort)?;
+                Ok(lines.read(file, shared.concat().into(), skip, take).await?.boxed())
             }
         }
-        Ok(crc.sum())
     }
 }
 
@@ -184,6 +238,17 @@ impl Section {
         let bytes = download::stream_range(file, self.start, self.length).await;
         bytes.map_err(|_| io::Error::other("a stored file can't be read"))
     }
+}
+
+/// Reads the head of a stored stack.
+pub(super) async fn read_stack(
+    stored: std::fs::File,
+    shape: SceneShape,
+) -> Result<Stack, FormatError> {
+    let size = (shape.frames, shape.height, shape.width);
+    let read = move || Stack::read(BufReader::new(stored), size, shape.channels());
+    let failed = |error: JoinError| FormatError::Internal(error.to_string());
+    tokio::task::spawn_blocking(read).await.map_err(failed)?
 }
 
 type ByteStream = BoxStream<'static, io::Result<Bytes>>;
@@ -213,6 +278,8 @@ fn abort(error: StoreError) -> io::Error {
 #[derive(Debug)]
 pub(super) struct Composed {
     pub(super) parts: Vec<Part>,
+    /// The recorded hash of the bytes; `None` for a file without a record.
+    pub(super) sha256: Option<Sha256>,
     /// The media type.
     pub(super) kind: &'static str,
     pub(super) disposition: String,
@@ -228,14 +295,18 @@ impl Composed {
         job: Job,
         request: (&Method, &HeaderMap),
     ) -> Result<Response> {
-        let mut hasher = sha2::Sha256::new();
-        self.parts.iter().for_each(|part| part.hash_inputs(&mut hasher));
+        let sha256 = self.sha256.unwrap_or_else(|| {
+            let mut hasher = sha2::Sha256::new();
+            self.parts.iter().for_each(|part| part.hash_inputs(&mut hasher));
+            Sha256::new(hasher.finalize().into())
+        });
         let download = Download {
-            sha256: Sha256::new(hasher.finalize().into()),
+            sha256,
             size: self.parts.iter().map(Part::length).sum(),
             kind: self.kind,
             disposition: self.disposition,
-            accepts_ranges: true,
+            // A range of a JSON document is not valid JSON.
+            accepts_ranges: self.kind != "application/json",
         };
         let parts = self.parts;
         let read = async |start, length| {
@@ -290,11 +361,11 @@ fn select(parts: Vec<Part>, start: u64, length: u64) -> Vec<Selected> {
 mod tests {
     use axum::body::Bytes;
 
-    use super::{Content, Part, select};
+    use super::{Part, Piece, select};
 
     #[test]
     fn a_range_selects_bytes_of_each_part() {
-        let part = |text| Part::Content(Content::Bytes(Bytes::from(text)));
+        let part = |text| Part::Piece(Piece::Bytes(Bytes::from(text)));
         let parts = || ["abc", "", "defg"].map(part).to_vec();
         let ranges = |start, length| {
             let selection = select(parts(), start, length);

@@ -1,81 +1,54 @@
 //! The stack of frames as EXR, with the expected error of the pixels as a layer of each part.
 
-use std::fs::File;
-use std::io::BufReader;
 use std::sync::Arc;
 
-use axum::body::Bytes;
 use axum::http::{HeaderMap, Method};
 use axum::response::Response;
 
 use super::super::error::{ApiError, Result};
 use super::super::results::{attachment, media_type, result_file};
 use super::clip::{Clip, values_offset};
-use super::composed::{Composed, Content, Part, Section, Source};
-use super::lines::{Compose, Lines};
-use engine::job::SceneShape;
+use super::composed::{Composed, Part, Piece, Section, Source, read_stack};
+use super::lines::Compose;
 use engine::pipeline::assessment::{BLOCK, blocks};
-use formats::exr::{Layered, SIGMA};
-
-const STACK: &str = "stack.exr";
+use engine::pipeline::derived::STACK;
+use formats::exr::SIGMA;
 
 /// `exr?layers=sigma`: the stack with the layer of expected errors.
 pub(super) async fn with_sigma(clip: Clip, request: (&Method, &HeaderMap)) -> Result<Response> {
     let parts = parts(&clip).await?;
     let disposition = attachment(clip.job.id, clip.snapshot, "stack-sigma.exr");
-    let composed = Composed { parts, kind: media_type(STACK), disposition };
+    let composed = Composed { parts, sha256: None, kind: media_type(STACK), disposition };
     composed.send(&clip.app, clip.job, request).await
 }
 
 /// Lays out the stack: each stored line, extended by the expected errors of its pixels.
 async fn parts(clip: &Clip) -> Result<Vec<Part>> {
     let snapshot = clip.snapshot;
-    let (file, _) = result_file(&clip.app, &clip.job, snapshot, "error.npy").await?;
-    let errors = Source { snapshot, file };
+    let (error, _) = result_file(&clip.app, &clip.job, snapshot, "error.npy").await?;
+    let errors = Source { snapshot, file: error.file };
     let (file, _, stored) = clip.app.store.open_result(&clip.job, snapshot, STACK).await?;
-    let stack = Source { snapshot, file };
+    let source = Source { snapshot, file };
     let shape = clip.job.spec.frame_shape();
     let (frames, height, width) = (shape.frames, shape.height, shape.width);
-    let mut layered = read_layout(stored, shape).await?;
-    let head = Bytes::from(std::mem::take(&mut layered.head));
-    let (rows, columns) = blocks(height, width);
-    let frame_bytes = (rows * columns * size_of::<f32>()) as u64;
-    let first = values_offset(&errors, frames as u64 * frame_bytes)?;
-    let part_bytes = (height * layered.stored_bytes) as u64;
-    let (start, count) = (layered.start, height as u64);
-    let (stored_bytes, composed_bytes) = (layered.stored_bytes as u64, layered.line_bytes as u64);
-    let compose: Compose = Arc::new(move |errors, number, stored, composed| {
-        layered.line(stored, block_values(errors, number, width), composed);
-    });
-    let part = |k: u64| Part::Lines {
-        source: stack.clone(),
-        shared: Section {
-            source: errors.clone(),
-            start: first + k * frame_bytes,
-            length: frame_bytes,
-        },
-        lines: Lines {
-            start: start + k * part_bytes,
-            count,
-            stored_bytes,
-            composed_bytes,
-            compose: compose.clone(),
-        },
-    };
-    Ok([Part::Content(Content::Bytes(head))]
-        .into_iter()
-        .chain((0..frames as u64).map(part))
-        .collect())
-}
-
-/// Reads the header of the stored stack, and lays out the stack with the additional layer.
-async fn read_layout(stored: File, shape: SceneShape) -> Result<Layered> {
-    let size = (shape.frames, shape.height, shape.width);
-    let read = move || Layered::read(BufReader::new(stored), size, shape.channels(), SIGMA);
-    let read =
-        tokio::task::spawn_blocking(read).await.map_err(|error| ApiError::internal(&error))?;
     // The service wrote the file, so its faults are internal errors.
-    read.map_err(|error| ApiError::internal(&error))
+    let stack = read_stack(stored, shape).await.map_err(|error| ApiError::internal(&error))?;
+    let head = stack.layered_head(SIGMA).map_err(|error| ApiError::internal(&error))?;
+    let lines = stack.lines();
+    let (rows, columns) = blocks(height, width);
+    let block_bytes = (rows * columns * size_of::<f32>()) as u64;
+    let first = values_offset(errors.file.size, frames as u64 * block_bytes)?;
+    let compose: Compose = Arc::new(move |errors, number, stored, composed| {
+        lines.layered_line(stored, block_values(errors, number, width), composed);
+    });
+    let composition = (lines.layered_bytes(), compose);
+    let part = |k: usize| {
+        let start = first + k as u64 * block_bytes;
+        let section = Section { source: errors.clone(), start, length: block_bytes };
+        clip.lines(&source, k..k + 1, Some(section), composition.clone()).map(Part::Piece)
+    };
+    let head = Ok(Part::Piece(Piece::Bytes(head.into())));
+    [head].into_iter().chain((0..frames).map(part)).collect()
 }
 
 /// The value of each pixel of a line, given the values of all blocks.

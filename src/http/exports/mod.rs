@@ -1,5 +1,5 @@
-//! Exports: the frames of a snapshot or of a whole job, in formats that other programs read. Most exports are composed
-//! while a client reads them, and take no disk space. Workers encode movies.
+//! Exports: the frames of a snapshot or of a whole job, in formats that other programs read. Frames are stored once, as
+//! the stack `stack.exr`. Other exports of frames are composed of it while a client reads them. Workers encode movies.
 
 mod archive;
 mod clip;
@@ -15,7 +15,7 @@ use serde::Deserialize;
 
 use super::error::{ApiError, Code, Result};
 use super::extract::{Params, QueryOf};
-use super::results::{frame_file, send};
+use super::results::frame_file;
 use clip::Clip;
 use engine::job::MovieFormat;
 use format::Format;
@@ -52,9 +52,9 @@ pub(super) async fn file(
     match (clip.format, clip.snapshot) {
         (Format::Exr, Some(_)) => match query.layers {
             Some(Layer::Sigma) => exr::with_sigma(clip, request).await,
-            None => stored(&clip, "stack.exr", request).await,
+            None => clip::result(clip, "stack.exr", request).await,
         },
-        (Format::Npy, Some(_)) => stored(&clip, "frames.npy", request).await,
+        (Format::Npy, Some(_)) => clip::result(clip, "frames.npy", request).await,
         (Format::Npy, None) => clip::array(clip, request).await,
         (Format::Tiff, _) => clip::tiff(clip, request).await,
         (Format::ZarrZip, _) => archive::zarr(clip, request).await,
@@ -65,9 +65,9 @@ pub(super) async fn file(
                 "the sensor of this job is grey and has no mosaic: the export npy has its frames";
             Err(ApiError::new(Code::NotFound, detail))
         }
-        (Format::Mosaic, Some(_)) => stored(&clip, "mosaic.npy", request).await,
-        (Format::Error, Some(_)) => stored(&clip, "error.npy", request).await,
-        (Format::Manifest, _) => stored(&clip, "manifest.json", request).await,
+        (Format::Mosaic, Some(_)) => clip::result(clip, "mosaic.npy", request).await,
+        (Format::Error, Some(_)) => clip::result(clip, "error.npy", request).await,
+        (Format::Manifest, _) => clip::result(clip, "manifest.json", request).await,
         (Format::Zip, None) => archive::archive(clip, request).await,
         (Format::Zip, Some(_)) => {
             not_found("zip exports the whole job: ask for it at exports of the job")
@@ -104,7 +104,7 @@ pub(super) async fn part(
                 let detail = format!("frames are 1.exr to {frames}.exr, and 1.png to {frames}.png");
                 ApiError::new(Code::NotFound, detail)
             })?;
-            stored(&clip, &name, request).await
+            clip::result(clip, &name, request).await
         }
         _ => not_found(
             "this format is a single file; only zarr and the frames of a snapshot are directories",
@@ -114,9 +114,4 @@ pub(super) async fn part(
 
 fn not_found(detail: &str) -> Result<Response> {
     Err(ApiError::new(Code::NotFound, detail))
-}
-
-/// Sends a stored result file.
-async fn stored(clip: &Clip, name: &str, request: (&Method, &HeaderMap)) -> Result<Response> {
-    send(&clip.app, &clip.job, clip.snapshot, name, request).await
 }

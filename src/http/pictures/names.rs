@@ -19,6 +19,7 @@ use crate::http::results::{result_file, white_level};
 use crate::http::truth;
 use engine::intake::IntakeError;
 use engine::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
+use engine::pipeline::derived::STACK;
 use engine::pipeline::records::TileTaskRecord;
 use formats::{self, Channels, FormatError};
 use store::{Calibration, Job, Measurement, StoreError, TileResult};
@@ -272,7 +273,7 @@ async fn frames_stack(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
         let bands = spec.dispersion.clone()?;
         Some(Arc::new(Dispersed { bands, sensor: (spec.shape.height, spec.shape.width) }))
     };
-    match app.store.open_result(job, Some(snapshot), "frames.npy").await {
+    match app.store.open_result(job, Some(snapshot), STACK).await {
         Ok((file, path, _)) => {
             return Ok(Stack {
                 shape,

@@ -11,7 +11,7 @@ use ndarray::{Array2, Array3, Axis, s};
 use crate::http::rendering::Picture;
 use engine::job::{Dispersion, MARGIN, Mosaic, Sha256};
 use engine::pipeline::assessment::BLOCK;
-use formats::{self, Channels, FormatError, Limits, npy, planar};
+use formats::{self, Channels, FormatError, Limits, exr, npy, planar};
 
 /// A stack of f32 \[frames, rows, columns\] that is read in windows.
 #[derive(Debug, Clone)]
@@ -48,7 +48,7 @@ pub(super) struct TrueFrame {
 pub(super) enum Files {
     /// A prepared array of an upload.
     Prepared(PathBuf),
-    /// The result file `frames.npy`.
+    /// The stack of frames of a result.
     Frames(PathBuf),
     /// Finished tiles on top of the preview. Pixels without either are NaN.
     Tiles(Arc<Unfinished>),
@@ -151,7 +151,8 @@ impl Stack {
                 planar::Reader::open(path, &limits)?.read_window(frames, rows, columns)
             }
             Files::Frames(path) => {
-                npy::open_windows(path, &limits)?.read_window(frames, rows, columns)
+                let channels = if self.mosaic.is_some() { Channels::Rgb } else { Channels::Grey };
+                exr::open_windows(path, self.shape, channels)?.read_window(frames, rows, columns)
             }
             Files::Tiles(unfinished) => {
                 let mut window = match &unfinished.preview {
@@ -474,7 +475,8 @@ mod tests {
         Channels, Dispersed, Dispersion, Files, FinishedTile, Mosaic, Stack, TrueFrame, Unfinished,
     };
     use engine::job::{DispersionAxis, MaskExtent};
-    use formats::{npy, planar};
+    use formats::exr::{self, Attributes};
+    use formats::planar;
     use ndarray::{Array2, Array3, Axis, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
@@ -485,6 +487,21 @@ mod tests {
         stack.outer_iter().for_each(|frame| writer.write_frame(frame).unwrap());
         writer.finish().unwrap();
         path
+    }
+
+    /// The stack of frames of a result.
+    fn assembled(folder: &std::path::Path, frames: &Array3<f32>, channels: Channels) -> Files {
+        let (count, height, samples) = frames.dim();
+        let parts = vec![Attributes::default(); count];
+        let stack = exr::Stack::new((height, samples / channels.count()), channels, &parts);
+        let stack = stack.unwrap();
+        let mut bytes = stack.head();
+        for (k, frame) in frames.outer_iter().enumerate() {
+            stack.lines().encode((k, 0), frame, &mut bytes);
+        }
+        let path = folder.join("stack.exr");
+        std::fs::write(&path, bytes).unwrap();
+        Files::Frames(path)
     }
 
     fn stack(shape: (usize, usize, usize), files: Files) -> Stack {
@@ -512,9 +529,7 @@ mod tests {
         };
         let preview = Some(prepared(folder.path(), "preview", &sensor));
         let before = dispersed(Files::Tiles(Arc::new(Unfinished { preview, tiles: Vec::new() })));
-        let path = folder.path().join("frames.npy");
-        npy::write_f32(&path, cube.view()).unwrap();
-        let after = dispersed(Files::Frames(path));
+        let after = dispersed(assembled(folder.path(), &cube, Channels::Grey));
         for (k, frame) in cube.outer_iter().enumerate() {
             let shown = |stack: &Stack| {
                 let picture = stack.frame(k);
@@ -589,8 +604,6 @@ mod tests {
         for (raw, mut colours) in raw.outer_iter().zip(colours.outer_iter_mut()) {
             colours.assign(&mosaic.demosaick(raw, (0, 0)));
         }
-        let array = folder.path().join("frames.npy");
-        npy::write_colours(&array, colours.view()).unwrap();
         // The preview has one pixel for each colour. Each tile is a sub-image.
         let coarse = Array3::from_shape_fn((2, 2, 2), |(k, i, j)| raw[[k, i, j]]);
         let preview = Some(prepared(folder.path(), "preview", &coarse));
@@ -604,7 +617,7 @@ mod tests {
         let unfinished =
             |tiles| Files::Tiles(Arc::new(Unfinished { preview: preview.clone(), tiles }));
         let mosaic_stack = |files| Stack { mosaic: Some(mosaic), ..stack((2, 16, 20), files) };
-        let assembled = mosaic_stack(Files::Frames(array));
+        let assembled = mosaic_stack(assembled(folder.path(), &colours, Channels::Rgb));
         let all_tiles = mosaic_stack(unfinished((0..4).map(tile).collect()));
         for (rows, columns) in [(0..16, 0..20), (3..9, 5..8), (7..8, 0..20)] {
             let window = |stack: &Stack| stack.window(0..2, rows.clone(), columns.clone()).unwrap();

@@ -44,7 +44,7 @@ pub use submission::{
 };
 pub use task::{
     MIN_MOVIE_SIDE, MOVIE_SIDE, MovieFormat, ResultFile, TaskKind, TaskProgress, TaskStage,
-    TaskState, movie_step,
+    TaskState, WrittenFile, movie_step,
 };
 pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, without_paths};
 pub use webhook::Webhook;

@@ -22,11 +22,11 @@ pub const MAX_TASKS: usize = 50_000;
 
 /// Bytes per voxel of a stored tile: one 32-bit float.
 const TILE_BYTES: u64 = 4;
-/// Bytes per voxel of the results: EXR frames, EXR stack and NumPy (32 bits each), and PNG (16 bits). Compression is
-/// ignored, because noise does not compress.
-const RESULT_BYTES: u64 = 4 + 4 + 4 + 2;
-/// Bytes per voxel of the results behind a mosaic: three colours, and the raw values.
-const COLOUR_BYTES: u64 = 3 * RESULT_BYTES + 4;
+/// Bytes per value of the results: the EXR stack (32 bits), from which other files are derived, and PNG (16 bits).
+/// Compression is ignored, because noise does not compress.
+const RESULT_BYTES: u64 = 4 + 2;
+/// Bytes per row of a frame: prefix (12) and table entry (8) of a line of the stack, and the filter of a PNG.
+const ROW_BYTES: u64 = 21;
 /// Bytes of headers, manifests and database rows per snapshot.
 const SNAPSHOT_BYTES: u64 = 1 << 20;
 
@@ -355,8 +355,9 @@ impl JobSpec {
             plan.tiles().map(|tile| (tile.height * tile.width) as u64).sum::<u64>()
         };
         let tiles = self.tile_plan().map_or(0, area) * frames;
-        let bytes = if self.shape.mosaic.is_some() { COLOUR_BYTES } else { RESULT_BYTES };
-        let results = voxels * bytes + SNAPSHOT_BYTES;
+        let values = voxels * self.shape.channels().count() as u64;
+        let rows = self.shape.height as u64 * frames;
+        let results = values * RESULT_BYTES + rows * ROW_BYTES + SNAPSHOT_BYTES;
         u64::from(self.snapshots.count) * results + self.snapshots_computed() * tiles * TILE_BYTES
     }
 }

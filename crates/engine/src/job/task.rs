@@ -336,3 +336,13 @@ pub struct ResultFile {
     pub size: u64,
     pub sha256: Sha256,
 }
+
+/// A file of a result as the task that makes it reports it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WrittenFile {
+    pub file: ResultFile,
+    /// CRC-32 of the bytes, by which ZIP archives check their members.
+    pub crc32: u32,
+    /// True for a file that is not on the disk, but derived from the stack of frames when it is read.
+    pub is_derived: bool,
+}

@@ -6,6 +6,7 @@
 pub mod arrays;
 pub mod assessment;
 pub mod blend;
+pub mod derived;
 pub mod error;
 pub mod manifest;
 pub mod movie;

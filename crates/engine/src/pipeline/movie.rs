@@ -8,13 +8,14 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array2, ArrayView2, Axis, s};
 use serde::{Deserialize, Serialize};
 
+use super::derived::STACK;
 use super::error::{PipelineError, Result};
 use super::progress::Monitor;
 use crate::job::{MovieFormat, SceneShape, Sha256, TaskStage, movie_step};
 use formats::display::Picture;
 use formats::gif::{self, GifWriter};
 use formats::movie::{self, Clip, MovieWriter};
-use formats::{Channels, FormatError, Limits, WindowReader, npy};
+use formats::{Channels, FormatError, WindowReader, exr};
 
 /// Number of samples that are read at a time: 16 MiB.
 const BAND_SAMPLES: usize = 4 << 20;
@@ -68,7 +69,7 @@ pub struct MovieTask {
     pub requested: bool,
     /// Frames per second of the scene, if known.
     pub scene_fps: Option<f64>,
-    /// The file `frames.npy` of each snapshot, and its recorded hash.
+    /// The stack of frames of each snapshot, and its recorded hash.
     pub clips: Vec<(PathBuf, Sha256)>,
 }
 
@@ -92,8 +93,8 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
     let file = File::options().write(true).open(path);
     let file = file.map_err(|source| PipelineError::File { name: "movie".into(), source })?;
     let mut writer = Writer::new(task.format, BufWriter::new(file), &clip)?;
-    for (index, (array, sha256)) in task.clips.iter().enumerate() {
-        let reader = open_checked(array, *sha256)?;
+    for (index, (stack, sha256)) in task.clips.iter().enumerate() {
+        let reader = open_checked(stack, *sha256, task.shape)?;
         monitor.check()?;
         for k in 0..frames {
             let frame = levels(&reader, k, (channels, step, task.window))?;
@@ -141,14 +142,15 @@ impl Writer {
 }
 
 /// Opens the frames of a snapshot after a check of their hash.
-fn open_checked(path: &Path, expected: Sha256) -> Result<WindowReader> {
-    let name = || "frames.npy".to_owned();
+fn open_checked(path: &Path, expected: Sha256, shape: SceneShape) -> Result<WindowReader> {
+    let name = || STACK.to_owned();
     let unreadable = |source| PipelineError::File { name: name(), source };
     let hashed = Sha256::of_reader(&mut File::open(path).map_err(unreadable)?);
     if hashed.map_err(unreadable)?.0 != expected {
         return Err(PipelineError::Result(name()));
     }
-    Ok(npy::open_windows(path, &Limits::default())?)
+    let size = (shape.frames, shape.height, shape.width);
+    Ok(exr::open_windows(path, size, shape.channels())?)
 }
 
 /// Reads frame `k` in bands of rows, as levels from 0 to 255.
@@ -184,15 +186,23 @@ mod tests {
     use crate::job::{MovieFormat, SceneShape, Sha256};
     use crate::pipeline::PipelineError;
     use crate::pipeline::progress::Monitor;
-    use formats::npy;
+    use formats::Channels;
+    use formats::exr::{Attributes, Stack};
 
     #[test]
     fn large_pictures_are_reduced_and_damaged_files_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let array = folder.path().join("frames.npy");
+        let path = folder.path().join("stack.exr");
         let frames = Array3::from_shape_fn((2, 77, 3841), |(k, i, j)| ((k + i + j) % 5) as f32);
-        npy::write_f32(&array, frames.view()).unwrap();
-        let sha256 = Sha256::of(&std::fs::read(&array).unwrap());
+        let parts = vec![Attributes::default(); 2];
+        let stack = Stack::new((77, 3841), Channels::Grey, &parts).unwrap();
+        let mut bytes = stack.head();
+        for (k, frame) in frames.outer_iter().enumerate() {
+            stack.lines().encode((k, 0), frame, &mut bytes);
+        }
+        std::fs::write(&path, &bytes).unwrap();
+        let sha256 = Sha256::of(&bytes);
+        let clip = path;
         let shape = SceneShape { frames: 2, height: 77, width: 3841, snapshots: 2, mosaic: None };
         let task = |sha256| MovieTask {
             format: MovieFormat::Mp4,
@@ -200,7 +210,7 @@ mod tests {
             window: DisplayWindow { black: 0.0, white: 4.0 },
             requested: false,
             scene_fps: Some(100.0),
-            clips: vec![(array.clone(), sha256); 2],
+            clips: vec![(clip.clone(), sha256); 2],
         };
         let path = folder.path().join("movie.mp4");
         std::fs::write(&path, "").unwrap();

@@ -1,13 +1,23 @@
-//! Splits the headers of an EXR file into attributes.
+//! The headers of an EXR file, split into attributes.
+//!
+//! The EXR crate writes attributes in the order of a hash map, which differs between processes. They are sorted here, so
+//! that equal frames give equal files. Readers ignore the order.
 
 use std::io::{self, BufRead, Read};
+
+use ::exr::error::Error as ExrError;
+use ::exr::meta::header::Header;
+use ::exr::meta::{MetaData, magic_number};
 
 /// Length of magic number and version, in bytes.
 const PROLOGUE_BYTES: usize = 8;
 /// Version flag of files with several parts. Their headers end with an empty one.
 const MULTI_PART: u8 = 0x10;
+/// Start of the attribute with the name of a part.
+const NAME: &[u8] = b"name\0";
 
 /// The part of a file before the chunk tables.
+#[derive(Debug, Clone)]
 pub(super) struct Head {
     prologue: [u8; PROLOGUE_BYTES],
     /// The attributes of each part. An attribute starts with its name and a zero byte, its type and a zero byte, and
@@ -16,6 +26,20 @@ pub(super) struct Head {
 }
 
 impl Head {
+    /// Errors: [`ExrError`] for headers that a strict reader refuses.
+    pub(super) fn new(headers: &[Header]) -> Result<Self, ExrError> {
+        let strict = true;
+        let requirements = MetaData::validate(headers, strict)?;
+        let mut bytes = Vec::new();
+        magic_number::write(&mut bytes)?;
+        requirements.write(&mut bytes)?;
+        Header::write_all(headers, &mut bytes, requirements.is_multilayer())?;
+        let mut head = Self::read(&mut &*bytes)?;
+        // Each attribute starts with its name and a zero byte, so sorting the bytes sorts the names.
+        head.parts.iter_mut().for_each(|attributes| attributes.sort());
+        Ok(head)
+    }
+
     pub(super) fn read(reader: &mut impl BufRead) -> io::Result<Self> {
         let mut head = Self { prologue: [0; PROLOGUE_BYTES], parts: Vec::new() };
         reader.read_exact(&mut head.prologue)?;
@@ -29,6 +53,15 @@ impl Head {
                 return Ok(head);
             }
         }
+    }
+
+    /// The head of a file that has only this part, without a name.
+    pub(super) fn single_part(&self, part: usize) -> Self {
+        let mut prologue = self.prologue;
+        prologue[5] &= !MULTI_PART;
+        let attributes = self.parts.get(part).into_iter().flatten();
+        let attributes = attributes.filter(|attribute| !attribute.starts_with(NAME)).cloned();
+        Self { prologue, parts: vec![attributes.collect()] }
     }
 
     /// True for a file with several parts, in which chunks contain the number of their part.

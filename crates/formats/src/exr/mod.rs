@@ -1,16 +1,21 @@
 //! OpenEXR: 32-bit float frames, one per file or one per part, with their provenance as attributes.
 //!
+//! Frames are not compressed, because the low bits of reconstructed floats are noise. On a camera clip with a little
+//! added noise, ZIP saves 3 % and takes about 0.2 s per megapixel, no compression 0.02 s. Each line of pixels can
+//! therefore be found by its number, and other files can be derived from a stored stack line by line.
+//!
 //! Every part has the channel `Y`, a channel with the name of a wavelength, or the channels `R`, `G` and `B`, in scan lines. Values are stored bit for bit.
 
 mod head;
-mod layer;
-mod order;
+mod header;
+mod lines;
 mod read;
-mod write;
+mod stack;
 
-pub use layer::{Layered, SIGMA};
-pub use read::{Part, read_stack};
-pub use write::{Attributes, write_frame, write_stack};
+pub use header::Attributes;
+pub use lines::Lines;
+pub use read::{Part, open_windows, read_stack};
+pub use stack::{SIGMA, Stack};
 
 use super::Channels;
 

@@ -12,9 +12,9 @@ use ::exr::meta::attribute::{AttributeValue, ChannelDescription, SampleType, Tex
 use ::exr::meta::header::Header;
 use ndarray::Array3;
 
-use super::{FRAME_TIME, names};
+use super::{FRAME_TIME, Lines, names};
 use crate::error::Result;
-use crate::{Channels, Format, FormatError, Limits};
+use crate::{Channels, Format, FormatError, Limits, StackInfo, WindowReader};
 
 /// The attributes of a part.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -27,6 +27,36 @@ pub struct Part {
     pub frame_time_s: Option<f64>,
     /// Frame rate as numerator and denominator.
     pub frames_per_second: Option<(i32, u32)>,
+}
+
+/// Opens a stack of this shape (frames, rows, columns) that this program has written, for reading windows. Colour frames
+/// are three times as wide.
+///
+/// Errors: I/O; [`FormatError::Truncated`] for a file that is too short for its lines.
+pub fn open_windows(
+    path: &Path,
+    (frames, height, width): (usize, usize, usize),
+    channels: Channels,
+) -> Result<WindowReader> {
+    let file = File::open(path).map_err(FormatError::io("open the EXR file"))?;
+    let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
+    let lines = Lines::new(frames, width, channels);
+    let promised = (frames * height * lines.stored_bytes()) as u64;
+    let start = length.checked_sub(promised).ok_or_else(|| FormatError::Truncated {
+        format: Format::Exr,
+        promised: format!("{frames} frames of {height}x{width} ({promised} bytes)"),
+        present: format!("{length} bytes"),
+    })?;
+    let info = StackInfo::new(
+        Format::Exr,
+        crate::SampleType::F32,
+        frames,
+        height,
+        width * channels.count(),
+    );
+    let places = names(channels).iter().map(|(_, place)| *place).collect();
+    let row = (start + lines.prefix_bytes() as u64, lines.stored_bytes() as u64);
+    Ok(WindowReader::with_layout(file, info, row, places))
 }
 
 /// Reads the frames (frame, row, column) of all parts, with their attributes. Colour frames have red, green and blue of

@@ -20,6 +20,7 @@ use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, MovieFormat, Sha256,
     Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
 };
+use engine::pipeline::derived::STACK;
 
 /// The longest pause of a task after a failure, in milliseconds: one that ends later was noted before
 /// the clock was set back.
@@ -97,8 +98,8 @@ pub struct MovieWork {
     pub white: Option<Value>,
     /// The values to show as black and as white, if they were requested.
     pub window: Option<Value>,
-    /// The array with the frames of each snapshot, and its recorded hash.
-    pub arrays: Vec<(PathBuf, Sha256)>,
+    /// The stack of frames of each snapshot, and its recorded hash.
+    pub clips: Vec<(PathBuf, Sha256)>,
 }
 
 /// The statement that looks for work: a task that is ready, or a lease that has expired. Parameters: now,
@@ -331,16 +332,16 @@ impl Store {
                 .fetch_one(&self.readers)
                 .await?;
         let window = self.movie_window(job.id, format.task(snapshot)).await?;
-        let mut arrays = Vec::new();
+        let mut clips = Vec::new();
         for snapshot in
             snapshot.map_or_else(|| job.spec.snapshots.indices().collect(), |one| vec![one])
         {
-            let (file, path) = self.result_file(&job, Some(snapshot), "frames.npy").await?;
-            arrays.push((path, file.sha256));
+            let (stack, path) = self.result_file(&job, Some(snapshot), STACK).await?;
+            clips.push((path, stack.file.sha256));
         }
         let white = white.map(|json| json.0);
         let (job, spec) = (job.id, job.spec);
-        let work = MovieWork { job, spec, format, measurement, white, window, arrays };
+        let work = MovieWork { job, spec, format, measurement, white, window, clips };
         Ok(Work::Movie(Box::new(work)))
     }
 

@@ -18,7 +18,7 @@ use crate::{Store, dir, on_files};
 use engine::intake::Refusal;
 use engine::job::{
     Assessment, CalibrationId, CalibrationReport, JobId, MeasurementId, ModelId, Registered,
-    ResultFile, Sha256, Submission, TaskKind, TaskProgress, TaskState, ThingId, Timestamp,
+    Sha256, Submission, TaskKind, TaskProgress, TaskState, ThingId, Timestamp, WrittenFile,
     planned_seconds,
 };
 
@@ -39,8 +39,8 @@ pub enum Product {
     TileCost(f64),
     /// A tile, a preview or a movie.
     File(StagedBlob),
-    /// The files of a snapshot (assemble) or of the job (manifest), which are on the disk.
-    Files(StagedDir, Vec<ResultFile>),
+    /// The files of a snapshot (assemble) or of the job (manifest). Derived files are not in the folder.
+    Files(StagedDir, Vec<WrittenFile>),
     Checked(Box<Checked>),
     Calibration(Box<CalibrationDone>),
 }
@@ -138,7 +138,7 @@ impl Store {
         job: JobId,
         kind: TaskKind,
         staged: StagedDir,
-        files: Vec<ResultFile>,
+        files: Vec<WrittenFile>,
     ) -> Result<()> {
         let folder = self.dir().results(job);
         let place = kind.snapshot().map(|snapshot| self.dir().snapshot_results(job, snapshot));

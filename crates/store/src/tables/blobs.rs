@@ -170,10 +170,10 @@ impl Store {
         origin: Origin,
     ) -> Result<()> {
         let (sha256, size) = (staged.sha256(), staged.size());
-        let (place, digests) = (self.dir().blob(&sha256), staged.digests());
+        let place = self.dir().blob(&sha256);
         let (identity, replaced) = on_files(move || staged.put(&place)).await?;
         replaced.into_iter().for_each(|path| self.removals.begin(path));
-        self.hashes.remember(identity, digests);
+        self.hashes.remember(identity, sha256);
         let now = Timestamp::now();
         sql!(
             "INSERT INTO blobs (sha256, size, origin, created_at, touched_at)

@@ -108,7 +108,8 @@ async fn is_whole(lab: &Lab, id: JobId) -> bool {
     };
     for snapshot in [Some(0), Some(1), None] {
         for file in lab.store.result_files(&job, snapshot).await.unwrap() {
-            if lab.store.open_result(&job, snapshot, &file.name).await.is_err() {
+            let name = &file.file.name;
+            if !file.is_derived && lab.store.open_result(&job, snapshot, name).await.is_err() {
                 return false;
             }
         }
