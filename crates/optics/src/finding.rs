@@ -195,7 +195,7 @@ findings! {
         "calibrate again once the optics are stable";
     MisplacedMasks: [Job], [Error],
         "the moved masks explain no light in a large part of the picture",
-        "check the stated `shift` of the `registration`: pixels down, then pixels to the right; or use `registration` auto";
+        "check the shift stated as `registration`: pixels down, then pixels to the right; or estimate it with `registration` auto";
     TurnedMasks: [Measurement], [Error],
         "the masks fit when they are flipped or their rows and columns exchanged",
         "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
