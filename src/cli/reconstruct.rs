@@ -472,8 +472,8 @@ impl<'a> Input<'a> {
             self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
             self.findings.extend(registered.finding());
         }
-        if let Some(shift) = registered.as_ref().and_then(Registered::applied_shift) {
-            let moved = registration::moved(masks, shift);
+        if let Some(correction) = registered.as_ref().and_then(Registered::correction) {
+            let moved = registration::moved(masks, correction);
             for mut snapshot in self.measurement.array.outer_iter_mut() {
                 let first = moved.index_axis(Axis(0), 0);
                 snapshot.zip_mut_with(&first, |y, mask| {

@@ -12,7 +12,7 @@ use super::tile::TileInput;
 use crate::job::Sha256;
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
-use reconstruction::registration::{Interpolated, MARGIN, covers};
+use reconstruction::registration::{Correction, Interpolated, MARGIN, covers};
 use reconstruction::tile::Window;
 
 /// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], divided by their full scale.
@@ -22,8 +22,8 @@ pub struct Arrays {
     pub masks: (PathBuf, Sha256),
     /// The file of the snapshots and its recorded hash.
     pub snapshots: (PathBuf, Sha256),
-    /// Pixels by which the masks have moved down and to the right since their calibration.
-    pub shift: Option<[f64; 2]>,
+    /// Correction of masks that have moved since their calibration.
+    pub correction: Option<Correction>,
 }
 
 impl Arrays {
@@ -71,8 +71,8 @@ impl Arrays {
         let masks = self.masks()?;
         let frames = snapshots.start as usize..snapshots.end as usize;
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
-        let y = snapshot_window(&snapshots, frames, place, self.shift)?;
-        let masks = mask_window(&masks, place, self.shift)?;
+        let y = snapshot_window(&snapshots, frames, place, self.correction)?;
+        let masks = mask_window(&masks, place, self.correction)?;
         let masks = masks.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         let all_snapshots = 0..y.dim().0;
         Ok(TileInput { masks, y, white, pieces: vec![all_snapshots] })
@@ -88,15 +88,17 @@ pub fn window(
     reader.read_lattice(frames, (place.rows.clone(), place.columns.clone()), place.step)
 }
 
-/// Reads a window of all masks after they moved by `shift`. NaN are unknown. It depends on the masks within
+/// Reads a window of all masks after a correction. NaN are unknown. It depends on the masks within
 /// [`MARGIN`] pixels only.
 pub fn mask_window(
     masks: &Reader,
     place: &Window,
-    shift: Option<[f64; 2]>,
+    correction: Option<Correction>,
 ) -> Result<Array3<f32>, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
-    let Some(shift) = shift else { return window(masks, 0..frames, place) };
+    let Some(Correction { shift, interpolation }) = correction else {
+        return window(masks, 0..frames, place);
+    };
     let around = |range: &Range<usize>, length: usize| {
         range.start.saturating_sub(MARGIN)..length.min(range.end + MARGIN)
     };
@@ -104,21 +106,21 @@ pub fn mask_window(
     let within = |range: &Range<usize>, start: usize| range.start - start..range.end - start;
     let inner = (within(&place.rows, rows.start), within(&place.columns, columns.start));
     let wide = Window { rows, columns, step: 1 };
-    let moved =
-        Interpolated::new(window(masks, 0..frames, &wide)?.view()).window(shift, inner.0, inner.1);
+    let masks = window(masks, 0..frames, &wide)?;
+    let moved = Interpolated::new(masks.view(), interpolation).window(shift, inner.0, inner.1);
     let step = place.step.cast_signed();
     Ok(moved.slice(s![.., ..;step, ..;step]).to_owned())
 }
 
-/// Reads a window of snapshots. Pixels without a known mask after a shift are NaN, as if they were not measured.
+/// Reads a window of snapshots. Pixels without a known mask after a correction are NaN, as if they were not measured.
 pub fn snapshot_window(
     snapshots: &Reader,
     range: Range<usize>,
     place: &Window,
-    shift: Option<[f64; 2]>,
+    correction: Option<Correction>,
 ) -> Result<Array3<f32>, FormatError> {
     let mut y = window(snapshots, range, place)?;
-    let Some(shift) = shift else { return Ok(y) };
+    let Some(Correction { shift, .. }) = correction else { return Ok(y) };
     let (height, width) = (snapshots.info().height, snapshots.info().width);
     for ((_, row, column), value) in y.indexed_iter_mut() {
         let at = (place.rows.start + row * place.step, place.columns.start + column * place.step);

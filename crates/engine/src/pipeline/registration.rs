@@ -6,7 +6,7 @@ use super::arrays::{Arrays, mask_window};
 use super::error::Result;
 use super::progress::Monitor;
 use crate::job::{Registered, RegistrationRequest, SnapshotRange, TaskStage};
-use reconstruction::registration;
+use reconstruction::registration::{self, Correction, Interpolation};
 use reconstruction::tile::Window;
 
 /// Reason for sensors with colours. The planes of a mosaic sample the masks at every second pixel only.
@@ -31,11 +31,21 @@ pub fn register(
         return Ok(outcome);
     }
     let Some((rows, columns)) = registration::choose(light, y) else {
-        return Ok(Some(Registered::skipped(SMALL)));
+        return Ok(Some(match request {
+            RegistrationRequest::Shift(shift) => {
+                let interpolation = Interpolation::default();
+                Registered::stated(Correction { shift, interpolation })
+            }
+            _ => Registered::skipped(SMALL),
+        }));
     };
     let place = Window { rows: rows.clone(), columns: columns.clone(), step: 1 };
     let masks = piece(&place)?;
     let y = y.slice(s![rows, columns]);
+    if let RegistrationRequest::Shift(shift) = request {
+        let interpolation = registration::interpolation(masks.view(), y, shift, proceed)?;
+        return Ok(Some(Registered::stated(Correction { shift, interpolation })));
+    }
     let found = registration::register(masks.view(), y, proceed)?;
     Ok(Some(found.map_or_else(|| Registered::skipped(DARK), Registered::from)))
 }
@@ -44,8 +54,7 @@ pub fn register(
 fn without_estimate(request: RegistrationRequest, is_coloured: bool) -> Option<Option<Registered>> {
     match request {
         RegistrationRequest::Off => Some(None),
-        RegistrationRequest::Shift(shift) => Some(Some(Registered::stated(shift))),
-        RegistrationRequest::Auto => is_coloured.then(|| Some(Registered::skipped(COLOUR))),
+        _ => is_coloured.then(|| Some(Registered::skipped(COLOUR))),
     }
 }
 
@@ -72,8 +81,12 @@ pub fn register_stored(
     })
 }
 
-/// Masks \[B,H,W\] in memory after they moved by `shift`, with NaN where their value is unknown.
-pub fn moved(masks: ArrayView3<'_, f32>, shift: [f64; 2]) -> Array3<f32> {
+/// Masks \[B,H,W\] in memory after a correction, with NaN where their value is unknown.
+pub fn moved(masks: ArrayView3<'_, f32>, correction: Correction) -> Array3<f32> {
     let (_, height, width) = masks.dim();
-    registration::Interpolated::new(masks).window(shift, 0..height, 0..width)
+    registration::Interpolated::new(masks, correction.interpolation).window(
+        correction.shift,
+        0..height,
+        0..width,
+    )
 }
