@@ -13,7 +13,7 @@ use super::arguments::{
 use super::client::{Client, Result};
 use super::fields::Role;
 use engine::job::{
-    Algorithm, CalibrationId, Dispersion, Mosaic, RegistrationRequest, Sequence, Sha256,
+    Algorithm, CalibrationId, Dispersion, JobId, Mosaic, RegistrationRequest, Sequence, Sha256,
 };
 use formats::{Axes, Crop, Packing};
 
@@ -21,11 +21,17 @@ use formats::{Axes, Crop, Packing};
 #[derive(Debug, Args)]
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
-    #[arg(long, value_name = "ID", required_unless_present = "masks", help_heading = CALIBRATION)]
+    #[arg(long, value_name = "ID", required_unless_present_any = ["masks", "registration_of"],
+          help_heading = CALIBRATION)]
     calibration: Option<CalibrationId>,
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
+    /// A job that has moved its masks: they become a calibration. The same job creates one calibration only.
+    #[arg(long, value_name = "JOB", help_heading = CALIBRATION,
+          conflicts_with_all = ["calibration", "masks", "masks_array", "masks_axes", "masks_crop", "masks_frames",
+                                "masks_packing", "masks_full_scale", "mosaic", "bad_pixels"])]
+    registration_of: Option<JobId>,
     /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_array: Option<String>,
@@ -151,27 +157,34 @@ impl SubmissionArguments {
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
         let dispersion = self.dispersion.resolve()?;
-        let calibration = match (&self.calibration, &self.masks) {
-            (Some(_), _) if dispersion.is_some() => {
+        // One file of masks, or one job, creates one calibration for all clients.
+        let create = async |body: Value| {
+            let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
+            client.create_checked("/v1/calibrations", &body, &key).await
+        };
+        let calibration = match (&self.calibration, &self.masks, &self.registration_of) {
+            (Some(_), ..) | (_, None, Some(_)) if dispersion.is_some() => {
                 let text =
                     "--dispersion-offsets belongs to --masks: a calibration has its own dispersion";
                 return Err(CliError::Input(text.into()).into());
             }
-            (Some(id), _) => id.to_string(),
-            (None, Some(masks)) => {
+            (Some(id), ..) => id.to_string(),
+            (None, Some(masks), _) => {
                 let bad_pixels = match &self.bad_pixels {
                     Some(map) => Some(client.upload_with_bar(map).await?),
                     None => None,
                 };
                 let sent = client.upload_with_bar(masks).await?;
                 let body = self.calibration_request(sent, bad_pixels, dispersion);
-                // One file of masks creates one calibration for all clients.
-                let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-                let created = client.create_checked("/v1/calibrations", &body, &key).await;
-                created.map_err(|error| error.about(Role::Masks, masks))?
+                create(body).await.map_err(|error| error.about(Role::Masks, masks))?
             }
-            (None, None) => {
-                let text = "give --masks FILE or --calibration ID";
+            (None, None, Some(job)) => {
+                let mut body = Map::from_iter([("registration_of".to_owned(), json!(job))]);
+                add(&mut body, "name", json!(self.masks_name));
+                create(Value::Object(body)).await?
+            }
+            (None, None, None) => {
+                let text = "give --masks FILE, --calibration ID or --registration-of JOB";
                 return Err(CliError::Input(text.into()).into());
             }
         };

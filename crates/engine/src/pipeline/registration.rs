@@ -1,11 +1,18 @@
 //! Registration of the masks of a job, which is decided once before its other tasks.
 
-use ndarray::{Array3, ArrayView2, ArrayView3, s};
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use super::arrays::{Arrays, mask_window};
 use super::error::Result;
 use super::progress::Monitor;
 use crate::job::{Registered, RegistrationRequest, SnapshotRange, TaskStage};
+use formats::planar::{self, Reader};
+use formats::validate::MaskStatistics;
+use formats::{FormatError, Limits, StackInfo};
 use reconstruction::registration::{self, Correction, Interpolation};
 use reconstruction::tile::Window;
 
@@ -14,6 +21,9 @@ const COLOUR: &str = "masks of colour sensors and spectral cameras are not regis
 const SMALL: &str = "the picture is too small to register the masks";
 const DARK: &str = "the piece on which masks are registered has no light or no measured pixels, or its reconstruction \
                     diverges";
+
+/// Height in rows of the bands in which stored masks are moved.
+const BAND: usize = 64;
 
 /// Registers masks in memory: all of them \[B,H,W\], and one snapshot \[H,W\] on the scale on which the scene is on
 /// \[0,1\]. `None` if it is off.
@@ -89,4 +99,50 @@ pub fn moved(masks: ArrayView3<'_, f32>, correction: Correction) -> Array3<f32> 
         0..height,
         0..width,
     )
+}
+
+/// Moves stored masks in bands of rows, which go to `scratch`, an existing file. `step` gets the finished share, and then
+/// each moved mask \[H,W\], with NaN where its value is unknown.
+///
+/// Errors: those of reading, of writing and of `step`.
+pub fn correct(
+    masks: &Reader,
+    correction: Correction,
+    scratch: &Path,
+    mut step: impl FnMut(f64, Option<ArrayView2<'_, f32>>) -> Result<(), FormatError>,
+) -> Result<MaskStatistics, FormatError> {
+    let StackInfo { frames, height, width, .. } = *masks.info();
+    let bands: Vec<_> =
+        (0..height).step_by(BAND).map(|start| start..height.min(start + BAND)).collect();
+    let file = File::options().write(true).open(scratch).map_err(FormatError::io("open a file"))?;
+    // A frame of this file is a band of all masks.
+    let mut writer = planar::writer(BufWriter::new(file), bands.len(), frames * BAND, width)?;
+    for (index, rows) in bands.iter().enumerate() {
+        step(0.9 * index as f64 / bands.len() as f64, None)?;
+        let place = Window { rows: rows.clone(), columns: 0..width, step: 1 };
+        let moved = mask_window(masks, &place, Some(correction))?;
+        let mut band = Array2::zeros((frames * BAND, width));
+        for (mut part, mask) in band.axis_chunks_iter_mut(Axis(0), BAND).zip(moved.outer_iter()) {
+            part.slice_mut(s![..rows.len(), ..]).assign(&mask);
+        }
+        writer.write_frame(band.view())?;
+    }
+    writer.finish()?;
+    let moved = Reader::open(scratch, &Limits::default())?;
+    let (mut mask, mut light) =
+        (Array2::zeros((height, width)), Array2::<f64>::zeros((height, width)));
+    for frame in 0..frames {
+        for (index, rows) in bands.iter().enumerate() {
+            let part = frame * BAND..frame * BAND + rows.len();
+            let part = moved.read_window(index..index + 1, part, 0..width)?;
+            mask.slice_mut(s![rows.clone(), ..]).assign(&part.index_axis(Axis(0), 0));
+        }
+        light.zip_mut_with(&mask, |light, mask| *light += f64::from(mask.max(0.0)));
+        step(0.9 + 0.1 * frame as f64 / frames as f64, Some(mask.view()))?;
+    }
+    Ok(MaskStatistics {
+        dead_pixels: light.iter().filter(|light| **light == 0.0).count() as u64,
+        clipped_negative: 0,
+        mean: light.sum() / (frames * height * width) as f64,
+    })
 }
