@@ -152,9 +152,8 @@ pub fn register(
         let Some(step) = steps.peek() else { break };
         best.interpolation = search.interpolation(best.shift)?;
         let Some(fit) = search.refine(best, *step)? else { return Ok(None) };
-        (best.shift, uncertainty) = (fit.minimum, fit.uncertainty);
-        if fit.has_settled {
-            has_settled = true;
+        (best.shift, uncertainty, has_settled) = (fit.minimum, fit.uncertainty, fit.has_settled);
+        if has_settled {
             steps.next();
         }
     }
