@@ -46,9 +46,11 @@ const SIGNIFICANT: f64 = 3.0;
 const MIN_ENERGY: f32 = 0.05;
 /// Width in pixels of the border of a defect that is filled from its surroundings.
 const FILLED: usize = 3;
-/// Largest hold-out error of an accepted correction, relative to the error of the mean of the pixels around. Right masks stay
-/// below 0.2. Masks of another camera stay above 0.5, but a shift by half a pixel lowers their contrast, and so their error.
+/// Largest hold-out error of an accepted correction, relative to the error of the same masks [`ELSEWHERE`]. Interpolation
+/// lowers the contrast of wrong masks, and so their error. Their ratio stays above 0.7, that of most right masks below 0.1.
 const EXPLAINED: f64 = 0.5;
+/// Distance in whole pixels along both axes of the masks with which this error is compared.
+const ELSEWHERE: f64 = REACH as f64;
 /// Smallest correction in pixels; a smaller one changes nothing that can be seen.
 const SMALLEST: f64 = 0.03;
 
@@ -165,8 +167,13 @@ pub fn register(
     let norm = search.draws[1].norm(search.y.view());
     let length = best.shift[0].hypot(best.shift[1]);
     let converged = has_settled && best.shift.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
-    let is_explained =
-        after.iter().sum::<f64>() < EXPLAINED * search.draws[1].neighbour_error(search.y.view());
+    // Masks elsewhere with the same fractions of a pixel have lost as much contrast, but fit nothing.
+    let elsewhere = best.shift.map(|shift| shift - ELSEWHERE.copysign(shift));
+    let Some(wrong) = search.errors(Correction { shift: elsewhere, ..best }, 1, ITERATIONS.1)?
+    else {
+        return Ok(None);
+    };
+    let is_explained = after.iter().sum::<f64>() < EXPLAINED * wrong.iter().sum::<f64>();
     Ok(Some(Registration {
         correction: best,
         uncertainty,
@@ -248,7 +255,7 @@ impl<'a> Search<'a> {
         let masks = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
         let y = y.slice(inner).insert_axis(Axis(0)).to_owned();
         let draws = draw(&y);
-        let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + Interpolation::ALL.len()) + 2;
+        let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + Interpolation::ALL.len()) + 3;
         let total = ((2 * REACH + 1).pow(2) * ITERATIONS.0 + runs * ITERATIONS.1) as f64;
         Ok(Self { masks, interpolated, y, draws, proceed, done: 0.0, total })
     }
