@@ -119,13 +119,13 @@ async fn corrected_masks_become_a_calibration() {
     ] {
         assert_eq!(saved[fact], expected, "{saved:#}");
     }
-    // The saved masks fit the measurement. They are those that the job has used.
+    // The saved masks fit the measurement, and serve it as well as the correction within the job.
     let saved = saved["id"].as_str().unwrap();
     let again = id(&app.measure(saved, snapshot([6, 3])).await.expect(201));
     let (fits, frames) = run(&app, &again, &json!("auto")).await;
     assert!(fits["registered"]["applied"] == false && !has_moved_masks(&fits), "{fits:#}");
     let quality = [&corrected, &frames].map(|file| psnr(SCENE, 0, &values(file)));
-    assert!((quality[0] - quality[1]).abs() < 0.3, "{quality:?}");
+    assert!(quality[1] > quality[0] - 0.3, "{quality:?}");
 
     let (off, _) = run(&app, &moved, &json!("off")).await;
     let cancelled = app
