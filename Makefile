@@ -7,7 +7,7 @@ VENV ?= .venv
 JUDGES := $(VENV)/judges
 TRAINING := $(VENV)/training
 
-.PHONY: release version install dist dist-check wheel demo test clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
+.PHONY: release version install dist dist-check wheel demo test test-gpu clients client-check deploy-check e2e runtime judges fmt lint prose docs serve clean faults load cluster fuzz schemathesis deny \
 	bench-latency bench-peers bench-scale eval-models eval-loop eval-registration eval-wrong-inputs eval-real evaluation-data
 
 demo: runtime ## reconstruct a real clip through the real HTTP service
@@ -20,9 +20,14 @@ test: runtime judges $(TRAINING)/.stamp ## run all tests
 		SCI_RECON_TRAINING=$(abspath $(TRAINING))/bin/python $(CARGO) test --workspace
 	$(TRAINING)/bin/python research/training/test_pipeline.py
 
-deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them
+# The driver of Debian's package chromium.
+VULKAN_ICD ?= /usr/lib/chromium/vk_swiftshader_icd.json
+test-gpu: ## test the kernels of the feature gpu on software Vulkan
+	VK_ICD_FILENAMES=$(VULKAN_ICD) $(CARGO) test --package sci-recon-reconstruction --lib --features gpu gpu::
+
+deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them, and use the service behind nginx and Caddy
 	$(CARGO) build --quiet
-	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon
+	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon $(VENV)/uploads
 
 client-check: wheel ## check types, style and wheel of the Python client
 	cd clients/python && $(abspath $(JUDGES))/bin/python -m mypy src && $(abspath $(JUDGES))/bin/python -m ruff check src && \
@@ -46,7 +51,7 @@ VERSION := $(PACKAGE)$(if $(COMMIT), ($(COMMIT)))
 PROGRAM := $${CARGO_TARGET_DIR:-target}/release/sci-recon
 PREFIX ?= /usr/local
 release: runtime
-	SCI_RECON_VERSION="$(VERSION)" $(CARGO) build --release --locked
+	SCI_RECON_VERSION="$(VERSION)" $(CARGO) build --release --locked $(if $(FEATURES),--features $(FEATURES))
 
 version: ## print the version of a build of this commit
 	@echo "$(VERSION)"
@@ -107,11 +112,13 @@ fuzz: ## fuzz every decoder for SECONDS seconds of CPU; needs cargo install carg
 SECONDS ?= 60
 
 SCHEMATHESIS := $(VENV)/schemathesis
-schemathesis: runtime $(SCHEMATHESIS)/.stamp ## fuzz the API against its contract, with and without a token
+# Largest number of examples per operation and run. 60 make over 7,000 requests in the first of three runs.
+EXAMPLES ?= 60
+schemathesis: runtime $(SCHEMATHESIS)/.stamp ## fuzz the API against its contract, with and without a token; EXAMPLES=60
 	$(CARGO) build --release
 	ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(PYTHON) tests/judges/schemathesis_runs.py $(SCHEMATHESIS)/bin/schemathesis \
-		$${CARGO_TARGET_DIR:-target}/release/sci-recon
+		$${CARGO_TARGET_DIR:-target}/release/sci-recon $(EXAMPLES)
 $(SCHEMATHESIS)/.stamp: tests/judges/schemathesis.txt
 	$(PYTHON) -m venv $(SCHEMATHESIS)
 	$(SCHEMATHESIS)/bin/python -m pip install --quiet --requirement $<
@@ -202,7 +209,7 @@ fmt:
 	$(CARGO) fmt --all --check
 
 lint:
-	$(CARGO) clippy --workspace --all-targets -- -D warnings
+	$(CARGO) clippy --workspace --all-targets --features gpu -- -D warnings
 
 # Findings per 1,000 words of the whole repository. Lower it when the rate falls; the aim is 1.0.
 PROSE_RATE ?= 1.0

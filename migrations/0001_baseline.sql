@@ -142,100 +142,60 @@ CREATE TABLE request_keys (
 
 CREATE INDEX request_keys_id ON request_keys (id);
 
-CREATE TABLE calibrations (
-    -- Calibrations with masks.
-    id                TEXT PRIMARY KEY,
-    lab               TEXT NOT NULL,
-    token             TEXT REFERENCES tokens (id), -- its limit applies to the prepared array
-    name              TEXT,
-    masks             TEXT NOT NULL REFERENCES blobs (sha256),
-    prepared          TEXT NOT NULL REFERENCES blobs (sha256),
-    format            TEXT NOT NULL,
-    sample            TEXT NOT NULL,
-    axes              TEXT, -- order of the axes of an uploaded array; NULL for pictures
-    frames            INTEGER NOT NULL CHECK (frames > 0),
-    height            INTEGER NOT NULL CHECK (height > 0),
-    width             INTEGER NOT NULL CHECK (width > 0),
-    full_scale        REAL NOT NULL CHECK (full_scale > 0),
-    mask_mean         REAL NOT NULL,
-    dead_pixels       INTEGER NOT NULL,
-    clipped_negatives INTEGER NOT NULL,
-    -- The colours of a cell of 2x2 pixels, row by row; NULL for a grey sensor.
-    mosaic            TEXT CHECK (mosaic IN ('rggb', 'bggr', 'grbg', 'gbrg')),
-    -- Displacement of the bands of a spectral camera, as JSON; NULL for masks that were uploaded one by one.
-    dispersion        TEXT,
-    reading           TEXT, -- how the masks' file was read, as JSON; NULL for captures
-    created_at        INTEGER NOT NULL
+CREATE TABLE requests (
+    -- Calibrations, measurements and models, as labs asked for them.
+    id             TEXT PRIMARY KEY,
+    what           TEXT NOT NULL,    -- 'calibration', 'measurement' or 'model'
+    lab            TEXT NOT NULL,
+    token          TEXT REFERENCES tokens (id), -- its limit applies to the prepared array
+    name           TEXT,
+    calibration    TEXT,             -- that of a measurement or a model
+    request        TEXT NOT NULL,    -- as JSON
+    limits         TEXT NOT NULL,    -- of its check, as JSON
+    prepared_bytes INTEGER NOT NULL DEFAULT 0, -- promised on the disk for what is being made
+    origin         TEXT,             -- identifier of the HTTP request
+    refusal        TEXT,             -- why nothing is made, as JSON
+    created_at     INTEGER NOT NULL,
+    -- Set when it is ready:
+    prepared       TEXT REFERENCES blobs (sha256), -- the array that jobs read; of a model, its file
+    facts          TEXT, -- as JSON
+    CHECK ((prepared IS NULL) = (facts IS NULL))
 ) STRICT, WITHOUT ROWID;
 
-CREATE INDEX calibrations_lab ON calibrations (lab, id);
-CREATE INDEX calibrations_masks ON calibrations (masks);
-CREATE INDEX calibrations_prepared ON calibrations (prepared);
+CREATE INDEX requests_lab ON requests (lab, what, id);
+CREATE INDEX requests_promised ON requests (lab) WHERE prepared_bytes > 0;
+CREATE INDEX requests_calibration ON requests (calibration, what) WHERE calibration IS NOT NULL;
+CREATE INDEX requests_prepared ON requests (prepared) WHERE prepared IS NOT NULL;
+
+CREATE TABLE request_files (
+    -- The uploads that a request needs. Once it is ready, only the one that it was made from.
+    id     TEXT NOT NULL REFERENCES requests (id) ON DELETE CASCADE,
+    sha256 TEXT NOT NULL REFERENCES blobs (sha256),
+    PRIMARY KEY (id, sha256)
+) STRICT, WITHOUT ROWID;
+
+CREATE INDEX request_files_sha256 ON request_files (sha256);
 
 CREATE TABLE calibration_reports (
-    calibration TEXT PRIMARY KEY REFERENCES calibrations (id) ON DELETE CASCADE,
+    calibration TEXT PRIMARY KEY REFERENCES requests (id) ON DELETE CASCADE,
     report      TEXT NOT NULL -- as JSON
 ) STRICT, WITHOUT ROWID;
 
 CREATE TABLE calibration_maps (
     -- Pictures of a report. A table with row numbers, since its rows are large.
-    calibration TEXT NOT NULL REFERENCES calibrations (id) ON DELETE CASCADE,
+    calibration TEXT NOT NULL REFERENCES requests (id) ON DELETE CASCADE,
     name        TEXT NOT NULL,
     png         BLOB NOT NULL,
     PRIMARY KEY (calibration, name)
 ) STRICT;
 
-CREATE TABLE measurements (
-    id          TEXT PRIMARY KEY,
-    lab         TEXT NOT NULL,
-    token       TEXT REFERENCES tokens (id), -- its limit applies to the prepared array
-    name        TEXT,
-    calibration TEXT NOT NULL REFERENCES calibrations (id),
-    data        TEXT NOT NULL REFERENCES blobs (sha256),
-    prepared    TEXT NOT NULL REFERENCES blobs (sha256),
-    format      TEXT NOT NULL,
-    sample      TEXT NOT NULL,
-    axes        TEXT, -- order of the axes of an uploaded array; NULL for pictures
-    snapshots   INTEGER NOT NULL CHECK (snapshots > 0),
-    height      INTEGER NOT NULL,
-    width       INTEGER NOT NULL,
-    full_scale  REAL NOT NULL CHECK (full_scale > 0),
-    camera_fps  REAL CHECK (camera_fps > 0),
-    exposure_s  REAL CHECK (exposure_s > 0),
-    -- contiguous: the snapshots follow one another without a gap.
-    sequence    TEXT NOT NULL CHECK (sequence IN ('contiguous', 'separate')),
-    dark        TEXT, -- uploads that were subtracted, as JSON
-    warnings    TEXT, -- findings of the check, as JSON
-    reading     TEXT NOT NULL, -- how the file was read, as JSON
-    created_at  INTEGER NOT NULL
-) STRICT, WITHOUT ROWID;
-
-CREATE INDEX measurements_lab ON measurements (lab, id);
-CREATE INDEX measurements_calibration ON measurements (calibration);
-CREATE INDEX measurements_data ON measurements (data);
-CREATE INDEX measurements_prepared ON measurements (prepared);
-
-CREATE TABLE models (
-    id          TEXT PRIMARY KEY,
-    lab         TEXT NOT NULL,
-    name        TEXT,
-    calibration TEXT NOT NULL REFERENCES calibrations (id),
-    file        TEXT NOT NULL REFERENCES blobs (sha256), -- the ONNX file
-    facts       TEXT NOT NULL, -- results of its check, as JSON
-    created_at  INTEGER NOT NULL
-) STRICT, WITHOUT ROWID;
-
-CREATE INDEX models_lab ON models (lab, id);
-CREATE INDEX models_calibration ON models (calibration);
-CREATE INDEX models_file ON models (file);
-
 CREATE TABLE jobs (
     -- A table with row numbers, since its rows are large.
     id           TEXT PRIMARY KEY,
     lab          TEXT NOT NULL,
-    calibration  TEXT NOT NULL REFERENCES calibrations (id),
-    measurement  TEXT NOT NULL REFERENCES measurements (id),
-    model        TEXT REFERENCES models (id),
+    calibration  TEXT NOT NULL REFERENCES requests (id),
+    measurement  TEXT NOT NULL REFERENCES requests (id),
+    model        TEXT REFERENCES requests (id),
     truth        TEXT REFERENCES blobs (sha256), -- the true frames, if they are known
     label        TEXT,
     spec         TEXT NOT NULL, -- JobSpec as JSON
@@ -394,33 +354,6 @@ CREATE TABLE totals (
     onnxruntime    TEXT -- its version, as reported with the last task that used it
 ) STRICT, WITHOUT ROWID;
 
-CREATE TABLE requests (
-    id             TEXT PRIMARY KEY, -- of the calibration, measurement or model
-    what           TEXT NOT NULL,    -- 'calibration', 'measurement' or 'model'
-    lab            TEXT NOT NULL,
-    token          TEXT REFERENCES tokens (id),
-    name           TEXT,
-    calibration    TEXT,             -- that of a measurement or a model
-    request        TEXT NOT NULL,    -- as JSON
-    limits         TEXT NOT NULL,    -- of its check, as JSON
-    prepared_bytes INTEGER NOT NULL DEFAULT 0, -- promised on the disk for what is being made
-    origin         TEXT,             -- identifier of the HTTP request
-    refusal        TEXT,             -- why nothing is made, as JSON
-    created_at     INTEGER NOT NULL
-) STRICT, WITHOUT ROWID;
-
-CREATE INDEX requests_lab ON requests (lab, what, id);
-CREATE INDEX requests_promised ON requests (lab) WHERE prepared_bytes > 0;
-CREATE INDEX requests_calibration ON requests (calibration, what) WHERE calibration IS NOT NULL;
-
-CREATE TABLE request_files (
-    id     TEXT NOT NULL REFERENCES requests (id) ON DELETE CASCADE,
-    sha256 TEXT NOT NULL REFERENCES blobs (sha256),
-    PRIMARY KEY (id, sha256)
-) STRICT, WITHOUT ROWID;
-
-CREATE INDEX request_files_sha256 ON request_files (sha256);
-
 CREATE TABLE tasks (
     id          TEXT PRIMARY KEY,
     -- It is a part of this job, or makes something for this calibration, measurement, model or job:
@@ -537,36 +470,19 @@ BEGIN
     WHERE lab = OLD.lab AND kind = 'upload';
 END;
 
-CREATE TRIGGER prepared_masks_add AFTER INSERT ON calibrations
-    WHEN NOT EXISTS (SELECT 1 FROM calibrations
-                     WHERE prepared = NEW.prepared AND lab = NEW.lab AND id <> NEW.id)
-     AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = NEW.prepared AND lab = NEW.lab)
+CREATE TRIGGER prepared_add AFTER UPDATE OF prepared ON requests
+    WHEN OLD.prepared IS NULL AND NEW.prepared IS NOT NULL AND NEW.what <> 'model'
+     AND NOT EXISTS (SELECT 1 FROM requests WHERE prepared = NEW.prepared AND lab = NEW.lab
+                                              AND what <> 'model' AND id <> NEW.id)
 BEGIN
     INSERT INTO files_of_labs SELECT NEW.lab, 'prepared', 1, size FROM blobs WHERE sha256 = NEW.prepared
     ON CONFLICT (lab, kind) DO UPDATE SET files = files + 1, bytes = bytes + excluded.bytes;
 END;
 
-CREATE TRIGGER prepared_masks_remove AFTER DELETE ON calibrations
-    WHEN NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = OLD.prepared AND lab = OLD.lab)
-     AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = OLD.prepared AND lab = OLD.lab)
-BEGIN
-    UPDATE files_of_labs
-    SET files = files - 1, bytes = bytes - (SELECT size FROM blobs WHERE sha256 = OLD.prepared)
-    WHERE lab = OLD.lab AND kind = 'prepared';
-END;
-
-CREATE TRIGGER prepared_snapshots_add AFTER INSERT ON measurements
-    WHEN NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = NEW.prepared AND lab = NEW.lab)
-     AND NOT EXISTS (SELECT 1 FROM measurements
-                     WHERE prepared = NEW.prepared AND lab = NEW.lab AND id <> NEW.id)
-BEGIN
-    INSERT INTO files_of_labs SELECT NEW.lab, 'prepared', 1, size FROM blobs WHERE sha256 = NEW.prepared
-    ON CONFLICT (lab, kind) DO UPDATE SET files = files + 1, bytes = bytes + excluded.bytes;
-END;
-
-CREATE TRIGGER prepared_snapshots_remove AFTER DELETE ON measurements
-    WHEN NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = OLD.prepared AND lab = OLD.lab)
-     AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = OLD.prepared AND lab = OLD.lab)
+CREATE TRIGGER prepared_remove AFTER DELETE ON requests
+    WHEN OLD.prepared IS NOT NULL AND OLD.what <> 'model'
+     AND NOT EXISTS (SELECT 1 FROM requests WHERE prepared = OLD.prepared AND lab = OLD.lab
+                                              AND what <> 'model')
 BEGIN
     UPDATE files_of_labs
     SET files = files - 1, bytes = bytes - (SELECT size FROM blobs WHERE sha256 = OLD.prepared)

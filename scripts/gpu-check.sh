@@ -3,8 +3,8 @@
 #
 #   scripts/gpu-check.sh [--device gpu] [--sizes 256,512,1024] [--program FILE] [--library FILE] [--seconds 480]
 #
-# Three small scenes are reconstructed on both devices with the same networks. Then networks and default jobs are timed at
-# each size. Progress goes to standard error, one JSON object to standard output. Exit status: 0 if the results agree.
+# Three small scenes are reconstructed on both devices, by total variation alone and with the same networks. Then the kernels of
+# the solver, its loop, networks and default jobs are timed at each size. The program must be built with --features gpu. Progress goes to standard error, one JSON object to standard output. Exit status: 0 if the results agree.
 # In a folder that scripts/gpu-pack.sh packed, it uses the program, library and Vulkan loader of that folder.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -27,7 +27,7 @@ parser.add_argument('--seconds', type=float, default=480)
 options = parser.parse_args(sys.argv[2:])
 end = time.monotonic() + options.seconds
 FRAMES, SMALL, TOLERANCE = 8, 64, 1e-4
-report = {'device': options.device, 'scenes': {}, 'speed': {}, 'skipped': []}
+report = {'device': options.device, 'scenes': {}, 'kernels': None, 'speed': {}, 'skipped': []}
 
 
 def program(*arguments):
@@ -97,9 +97,12 @@ def reconstruct(folder, device, schedule=None):
     return program(*line), folder + '/' + device + '/frames.npy'
 
 
+def variation(iterations):
+    return {'prior': 'tv', 'iterations': iterations, 'tv_weight': .15, 'temporal_weight': .004, 'tolerance': 0}
+
+
 def stages(passes):
-    return [{'prior': 'tv', 'iterations': 4, 'tv_weight': .15, 'tolerance': 0},
-            {'prior': 'fastdvdnet', 'iterations': passes, 'sigma': [.1, .05], 'tolerance': 0}]
+    return [variation(4), {'prior': 'fastdvdnet', 'iterations': passes, 'sigma': [.1, .05], 'tolerance': 0}]
 
 
 def step(name, action):
@@ -112,17 +115,24 @@ def step(name, action):
 
 def compare(folder, name):
     inputs(folder, name, SMALL)
-    frames = [load(reconstruct(folder, device, stages(2))[1]) for device in ('cpu', options.device)]
-    same = len(frames[0]) == len(frames[1])
-    largest = max(abs(a - b) for a, b in zip(*frames))
-    report['scenes'][name] = {'max_difference': largest, 'agrees': same and largest <= TOLERANCE}
+    largest = 0
+    for schedule in [variation(40)], stages(2):
+        frames = [load(reconstruct(folder, device, schedule)[1]) for device in ('cpu', options.device)]
+        assert len(frames[0]) == len(frames[1])
+        largest = max(largest, *(abs(a - b) for a, b in zip(*frames)))
+    report['scenes'][name] = {'max_difference': largest, 'agrees': largest <= TOLERANCE}
 
 
 def measure(folder, size):
     inputs(folder, 'grating', size)
     voxels = FRAMES * size * size / 1e6
-    few, many = (reconstruct(folder, options.device, stages(passes))[0]['seconds'] for passes in (2, 10))
-    report['speed'][size] = {'network_mvoxel_per_s': round(8 * voxels / (many - few), 4) if many > few else None}
+    def speed(schedule, few, many):
+        """Megavoxels per second of one iteration."""
+        seconds = [reconstruct(folder, options.device, schedule(count))[0]['seconds'] for count in (few, many)]
+        difference = seconds[1] - seconds[0]
+        return round((many - few) * voxels / difference, 4) if difference > 0 else None
+    report['speed'][size] = {'network_mvoxel_per_s': speed(stages, 2, 10),
+                             'variation_mvoxel_per_s': speed(lambda count: [variation(count)], 100, 1100)}
     whole = reconstruct(folder, options.device)[0]
     report['speed'][size] |= {'job_seconds': whole['seconds'], 'job_cpu_seconds': whole['cpu_seconds'],
                               'job_mvoxel_per_s': round(voxels / whole['seconds'], 4)}
@@ -133,6 +143,9 @@ with tempfile.TemporaryDirectory() as folder:
         report['devices'] = step('devices', lambda: program('devices', '--json', '--onnxruntime', options.library))
         for name in ('grating', 'disc', 'squares'):
             step(f'scene {name}', lambda: compare(f'{folder}/{name}', name))
+        kernels = step('kernels', lambda: program('devices', '--json', '--onnxruntime', options.library,
+                                                  '--kernels', options.sizes))
+        report['kernels'] = kernels and kernels['kernels']
         for size in map(int, options.sizes.split(',')):
             step(f'size {size}', lambda: measure(f'{folder}/{size}', size))
     except RuntimeError as error:

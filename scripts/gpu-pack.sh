@@ -3,11 +3,15 @@
 #
 #   scripts/gpu-pack.sh PROGRAM LIBRARY [FOLDER]
 #
-# PROGRAM is a release build, LIBRARY the libonnxruntime.so of `scripts/fetch-onnxruntime.sh --gpu`. FOLDER (default
+# PROGRAM is a build with `cargo build --release --features gpu`, LIBRARY the libonnxruntime.so of `scripts/fetch-onnxruntime.sh --gpu`. FOLDER (default
 # gpu-check) receives program.tar.xz and library.tar. On that machine, extract both into one folder with
 # `python3 -m tarfile -e ARCHIVE FOLDER`, and run FOLDER/gpu-check.sh.
 set -euo pipefail
 program=${1:?the release build of sci-recon} library=${2:?the libonnxruntime.so with WebGPU} folder=${3:-gpu-check}
+if "$program" devices --kernels 16 2>&1 | grep -q -e '--features gpu'; then
+  echo "gpu-pack: $program has no kernels for a GPU: build it with --features gpu" >&2
+  exit 1
+fi
 limit=30000000
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -11,8 +11,7 @@ use ipnet::IpNet;
 use strum::IntoStaticStr;
 
 #[cfg(feature = "nats")]
-use engine::job::Pool;
-use engine::job::WorkerId;
+use engine::job::{Pool, Webhook, WorkerId};
 use engine::pipeline::networks::{NetworkError, find_library};
 use reconstruction::priors::onnx::Device;
 use store::Claimant;
@@ -69,7 +68,8 @@ pub struct ServeArguments {
         long = "webhook-host",
         env = "SCI_RECON_WEBHOOK_HOSTS",
         value_name = "HOST",
-        value_delimiter = ','
+        value_delimiter = ',',
+        value_parser = Webhook::allowed_host
     )]
     pub webhook_hosts: Vec<String>,
 
@@ -379,7 +379,8 @@ pub struct EngineArguments {
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
-    /// Device that runs networks: cpu, gpu (the first GPU of any vendor), or cuda:N (NVIDIA, from 0).
+    /// Device that runs networks, and total variation in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
+    /// cuda:N (NVIDIA, from 0; networks only).
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu",
           value_parser = device)]
     pub device: String,

@@ -2,15 +2,17 @@
 //! (<https://www.standardwebhooks.com>).
 
 use std::error::Error;
+use std::sync::Arc;
 use std::time::Duration;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use futures_util::future::join_all;
 use hmac::{Hmac, Mac};
 use reqwest::redirect::Policy;
 use reqwest::{Client, StatusCode};
 use serde_json::{Value, json};
+use tokio::task::JoinSet;
+use tokio::time::MissedTickBehavior;
 
 use engine::job::{Timestamp, Webhook};
 use store::{Job, Notification, Store, StoreError};
@@ -20,8 +22,11 @@ const TICK: Duration = Duration::from_secs(1);
 /// Time that a receiver has to answer.
 const TIMEOUT: Duration = Duration::from_secs(10);
 /// Notifications that are sent at the same time.
-const BATCH: u32 = 16;
-/// Pauses after failed attempts. After the last one the notification is given up.
+const MOST: usize = 64;
+/// Notifications of a lab that begin in a tick. A lab with a receiver that never answers has `TIMEOUT / TICK` times as
+/// many in progress, fewer than [`MOST`].
+const MOST_OF_LAB: u32 = 4;
+/// Pauses after failed attempts, from the end of [`TIMEOUT`]. After the last one the notification is given up.
 const PAUSES: [Duration; 9] = [
     Duration::from_secs(5),
     Duration::from_secs(10),
@@ -45,21 +50,36 @@ pub async fn send(store: Store, allowed: Vec<String>) {
             return;
         }
     };
+    let allowed: Arc<[String]> = allowed.into();
+    let mut running = JoinSet::new();
     let mut tick = tokio::time::interval(TICK);
+    tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         tick.tick().await;
-        let due = match store.due_notifications(BATCH).await {
+        while running.try_join_next().is_some() {}
+        let free = MOST.saturating_sub(running.len());
+        let due = match store.take_notifications(free, MOST_OF_LAB, next_attempt).await {
             Ok(due) => due,
             Err(error) => {
-                tracing::error!(%error, "notifications can't be read");
+                tracing::error!(%error, "no notification is sent: the attempt can't be recorded");
                 continue;
             }
         };
-        let sent = due.iter().map(|notification| notify(&store, &client, &allowed, notification));
-        for error in join_all(sent).await.into_iter().filter_map(Result::err) {
-            tracing::error!(%error, "a notification can't be recorded");
+        for notification in due {
+            let (store, client, allowed) = (store.clone(), client.clone(), allowed.clone());
+            running.spawn(async move {
+                if let Err(error) = notify(&store, &client, &allowed, &notification).await {
+                    tracing::error!(%error, "the result of a notification can't be recorded");
+                }
+            });
         }
     }
+}
+
+/// Time of the attempt after one that begins now; `None` if that is the last one.
+fn next_attempt(attempts: u32) -> Option<Timestamp> {
+    let pause = PAUSES.get((attempts as usize).checked_sub(1)?)?;
+    Some(Timestamp::now().after(TIMEOUT + *pause))
 }
 
 /// Sends a notification, and records how this ended.
@@ -79,16 +99,14 @@ async fn notify(
         }
         Err(failure) => failure,
     };
-    let pause = PAUSES.get(attempts as usize).filter(|_| !failure.is_final);
-    let next_at = pause.map(|pause| Timestamp::now().after(*pause));
     let (host, reason) = (webhook.place(), &failure.reason);
-    match next_at {
-        Some(next_at) => {
-            tracing::warn!(job = %job.id, host, reason, %next_at, "the webhook was not notified");
-        }
-        None => tracing::error!(job = %job.id, host, reason, "the notification was given up"),
+    let is_final = failure.is_final || next_attempt(attempts).is_none();
+    if is_final {
+        tracing::error!(job = %job.id, host, reason, "the notification was given up");
+    } else {
+        tracing::warn!(job = %job.id, host, reason, "the webhook was not notified");
     }
-    store.not_notified(id, reason, next_at).await
+    store.not_notified(id, reason, is_final).await
 }
 
 /// Why a notification was not received.
@@ -106,7 +124,7 @@ async fn post(
 ) -> Result<(), Failure> {
     if !webhook.is_allowed(allowed) {
         let reason = format!("the administrator does not allow the host {}", webhook.place());
-        return Err(Failure { reason, is_final: true });
+        return Err(Failure { reason, is_final: false });
     }
     let body = message(job).to_string();
     let id = format!("{}.{id}", job.id);

@@ -12,11 +12,10 @@ use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
 use crate::config::device;
 use engine::job::{
-    Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, Mosaic, RegistrationRequest,
-    Sequence,
+    Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, RegistrationRequest,
 };
 use engine::pipeline::NetworkSource;
-use formats::{Axes, Packing};
+use formats::{Axes, Crop, Packing};
 use reconstruction::priors::onnx::Device;
 use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
@@ -37,6 +36,52 @@ pub(super) struct ScheduleArguments {
     iterations: Option<u32>,
 }
 
+/// Options for reading a file of masks.
+#[derive(Debug, Args)]
+pub(super) struct MaskFileArguments {
+    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
+    #[arg(long, value_name = "NAME")]
+    pub(super) masks_array: Option<String>,
+    /// The order of the axes of the masks [default: the only one that fits].
+    #[arg(long, value_name = "ORDER", value_parser = named::<Axes>())]
+    pub(super) masks_axes: Option<Axes>,
+    /// Window of each mask: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole masks].
+    #[arg(long, value_name = "WINDOW")]
+    pub(super) masks_crop: Option<Crop>,
+    /// First and last mask, both included, counted from 0 [default: all masks].
+    #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
+    pub(super) masks_frames: Option<(usize, usize)>,
+    /// How the pixels of the masks are packed [default: one number per pixel].
+    #[arg(long, value_name = "NAME", value_parser = named::<Packing>())]
+    pub(super) masks_packing: Option<Packing>,
+    /// Map of the sensor's bad pixels, of the size of the masks: pixels that are not 0 are bad.
+    #[arg(long, value_name = "FILE")]
+    pub(super) bad_pixels: Option<PathBuf>,
+}
+
+/// Options for reading a file of snapshots, and for its correction.
+#[derive(Debug, Args)]
+pub(super) struct SnapshotFileArguments {
+    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
+    #[arg(long, value_name = "NAME")]
+    pub(super) array: Option<String>,
+    /// The order of the axes of the snapshots [default: the only one that fits].
+    #[arg(long, alias = "measurement-axes", value_name = "ORDER", value_parser = named::<Axes>())]
+    pub(super) axes: Option<Axes>,
+    /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
+    #[arg(long, alias = "measurement-crop", value_name = "WINDOW")]
+    pub(super) crop: Option<Crop>,
+    /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
+    #[arg(long, alias = "measurement-packing", value_name = "NAME", value_parser = named::<Packing>())]
+    pub(super) packing: Option<Packing>,
+    /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
+    #[arg(long, value_name = "FILE")]
+    pub(super) dark: Vec<PathBuf>,
+    /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
+    #[arg(long, value_name = "NUMBER")]
+    pub(super) saturation: Option<u32>,
+}
+
 /// The displacement of the bands of a spectral camera.
 #[derive(Debug, Args)]
 pub(super) struct DispersionArguments {
@@ -45,14 +90,14 @@ pub(super) struct DispersionArguments {
     #[arg(long, value_name = "LIST")]
     dispersion_offsets: Option<Numbers>,
     /// `column` if the bands are displaced to the right, `row` if downwards.
-    #[arg(long, value_name = "AXIS", default_value_t = DispersionAxis::Column, value_parser = dispersion_axis(),
+    #[arg(long, value_name = "AXIS", default_value_t = DispersionAxis::Column, value_parser = named::<DispersionAxis>(),
           requires = "dispersion_offsets")]
     dispersion_axis: DispersionAxis,
     /// Wavelength of each band in nm, in the same form as the offsets [default: none].
     #[arg(long, value_name = "LIST", requires = "dispersion_offsets")]
     dispersion_wavelengths: Option<Numbers>,
     /// The size of the mask: `scene` is that of a band, `measurement` that of the measurement.
-    #[arg(long, value_name = "SIZE", default_value_t = MaskExtent::Scene, value_parser = mask_extent(),
+    #[arg(long, value_name = "SIZE", default_value_t = MaskExtent::Scene, value_parser = named::<MaskExtent>(),
           requires = "dispersion_offsets")]
     dispersion_mask: MaskExtent,
 }
@@ -103,23 +148,14 @@ impl FromStr for Numbers {
     }
 }
 
-fn dispersion_axis() -> impl TypedValueParser<Value = DispersionAxis> {
-    PossibleValuesParser::new(DispersionAxis::VARIANTS)
-        .try_map(|name: String| name.parse::<DispersionAxis>())
-}
-
-fn mask_extent() -> impl TypedValueParser<Value = MaskExtent> {
-    PossibleValuesParser::new(MaskExtent::VARIANTS)
-        .try_map(|name: String| name.parse::<MaskExtent>())
-}
-
 /// Runtime and device of networks.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
     /// Path of libonnxruntime [default: next to the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
-    /// Device that runs networks: cpu, gpu (the first GPU of any vendor), or cuda:N (NVIDIA, from 0).
+    /// Device that runs networks, and total variation in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
+    /// cuda:N (NVIDIA, from 0; networks only).
     #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = device)]
     device: String,
 }
@@ -236,9 +272,7 @@ impl NetworkArguments {
     }
 
     /// The networks on the stated device.
-    ///
-    /// # Errors
-    /// The device can't run a network; the text has the remedy.
+    /// Errors: the device can't run a network; the text has the remedy.
     pub fn network(&self) -> Result<NetworkSource> {
         // An empty variable counts as not set.
         let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
@@ -250,27 +284,15 @@ impl NetworkArguments {
 
 /// Parses names of algorithms that need no network of the user.
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
-    named(&Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1])
+    named_of(&Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1])
 }
 
-/// Parses a colour pattern of a sensor.
-pub(super) fn mosaic() -> impl TypedValueParser<Value = Mosaic> {
-    PossibleValuesParser::new(Mosaic::VARIANTS).try_map(|name: String| name.parse::<Mosaic>())
-}
-
-/// Parses a kind of sequence.
-pub(super) fn sequence() -> impl TypedValueParser<Value = Sequence> {
-    PossibleValuesParser::new(Sequence::VARIANTS).try_map(|name: String| name.parse::<Sequence>())
-}
-
-/// Parses an order of axes.
-pub(super) fn axes() -> impl TypedValueParser<Value = Axes> {
-    PossibleValuesParser::new(Axes::VARIANTS).try_map(|name: String| name.parse::<Axes>())
-}
-
-/// Parses packings of pixels.
-pub(super) fn packing() -> impl TypedValueParser<Value = Packing> {
-    PossibleValuesParser::new(Packing::VARIANTS).try_map(|name: String| name.parse::<Packing>())
+/// Parses the names of the variants of `T`.
+pub(super) fn named<T>() -> impl TypedValueParser<Value = T>
+where
+    T: VariantNames + FromStr<Err = strum::ParseError> + Clone + Send + Sync + 'static,
+{
+    PossibleValuesParser::new(T::VARIANTS).try_map(|name: String| name.parse::<T>())
 }
 
 /// Parses `FIRST-LAST`: first and last frame, both included, counted from 0.
@@ -285,10 +307,10 @@ pub(super) fn frame_range(text: &str) -> Result<(usize, usize), String> {
 
 /// Parses names of all algorithms.
 pub(super) fn named_all() -> impl TypedValueParser<Value = Algorithm> {
-    named(Algorithm::VARIANTS)
+    named_of(Algorithm::VARIANTS)
 }
 
-fn named(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {
+fn named_of(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {
     let names: Vec<&str> = algorithms.iter().map(|algorithm| algorithm.into_str()).collect();
     PossibleValuesParser::new(names).try_map(|name: String| {
         let named =

@@ -9,6 +9,8 @@ use crate::audit::{Actor, AuditLog, Entry, Outcome};
 use crate::cli::error::Result;
 use crate::config::AuditArguments;
 use engine::job::Lab;
+use formats::DiskTrouble;
+use store::{Store, StoreError};
 
 /// A change that a command makes.
 #[derive(Debug)]
@@ -45,14 +47,22 @@ pub(super) fn audit_log(arguments: &AuditArguments, data: &Path) -> Result<Audit
     })
 }
 
-/// Makes a change, and records it with its outcome.
+/// Makes a change, and records it with its outcome. On a full disk the reserve is given up first.
 pub(super) async fn audited<T>(
+    store: &Store,
     log: &AuditLog,
     change: Change,
-    act: impl Future<Output = Result<T>>,
+    act: impl AsyncFn() -> Result<T, StoreError>,
 ) -> Result<T> {
     let Change { action, lab, object } = change;
-    let result = act.await;
+    let mut result = act().await;
+    if let Err(error) = &result
+        && error.disk_trouble() == Some(DiskTrouble::Full)
+        && store.give_up_reserve().await?
+    {
+        result = act().await;
+    }
+    let result = result.map_err(CliError::from);
     let outcome = match &result {
         Ok(_) => Outcome::Done,
         Err(CliError::Input(_)) => Outcome::Refused,

@@ -92,9 +92,7 @@ pub(super) fn limit_memory(bytes: u64) -> Result<(), String> {
 
 /// Confines this process as a worker, which may read the folders in `readable` and those of the system, and write
 /// to those in `writable`. Must run before the process starts a thread.
-///
-/// # Errors
-/// If the kernel lacks a part of the confinement; the text names it.
+/// Errors: the kernel lacks a part of the confinement; the text names it.
 pub(super) fn confine_worker(readable: &[&Path], writable: &[&Path]) -> Result<(), String> {
     let rules = DENIED_TO_WORKERS.iter().map(|&call| (call, Vec::new())).collect();
     let filter = filter(rules, SeccompAction::Allow, refusal(libc::EPERM)).map_err(text)?;
@@ -103,9 +101,7 @@ pub(super) fn confine_worker(readable: &[&Path], writable: &[&Path]) -> Result<(
 
 /// Confines this process as the network of a user, which may read the system's libraries and `readable`. Must run
 /// before the process starts a thread.
-///
-/// # Errors
-/// If the kernel lacks a part of the confinement; the text names it.
+/// Errors: the kernel lacks a part of the confinement; the text names it.
 pub(super) fn confine_network(readable: &[&Path]) -> Result<(), String> {
     let rules = network_rules().map_err(text)?;
     let allowed = filter(rules, refusal(libc::EPERM), SeccompAction::Allow).map_err(text)?;

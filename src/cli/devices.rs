@@ -30,6 +30,10 @@ pub struct Arguments {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+    /// Measure the kernels of the GPU on 8 frames with these sides in pixels, for example 256,512. Needs a build with the
+    /// feature gpu.
+    #[arg(long, value_name = "SIDES", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(1..))]
+    kernels: Vec<u16>,
 }
 
 /// A graphics card with a kernel driver.
@@ -57,8 +61,14 @@ struct Trial {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let cards = cards(Path::new("/"));
     let trials: Vec<Trial> = TRIED.iter().map(|&device| attempt(arguments, device)).collect();
+    let kernels =
+        if arguments.kernels.is_empty() { None } else { Some(kernels(&arguments.kernels)?) };
     if arguments.json {
-        print_line(serde_json::json!({"cards": cards, "devices": trials}))?;
+        let mut report = serde_json::json!({"cards": cards, "devices": trials});
+        if let Some(kernels) = kernels {
+            report["kernels"] = kernels;
+        }
+        print_line(report)?;
         return verdict(&trials);
     }
     print_line("Graphics cards:")?;
@@ -80,7 +90,36 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         };
         print_line(format!("  --device {device}: {outcome}"))?;
     }
+    if let Some(kernels) = kernels {
+        print_line(format!("Kernels:\n{kernels:#}"))?;
+    }
     verdict(&trials)
+}
+
+/// Frames of the measurement of kernels.
+#[cfg(feature = "gpu")]
+const KERNEL_FRAMES: usize = 8;
+
+/// The GPU, and for each side the megavoxels per second of each kernel and of their loop.
+#[cfg(feature = "gpu")]
+fn kernels(sides: &[u16]) -> Result<serde_json::Value> {
+    use reconstruction::gpu::{adapter::Gpu, speed::measure};
+
+    let gpu = std::sync::Arc::new(Gpu::open()?);
+    let mut report = serde_json::json!({"gpu": gpu.name(), "mvoxel_per_s": {}});
+    for &side in sides {
+        for speed in measure(&gpu, KERNEL_FRAMES, side.into())? {
+            let rounded = (1e3 * speed.mvoxel_per_s).round() / 1e3;
+            report["mvoxel_per_s"][side.to_string()][speed.kernel] = rounded.into();
+        }
+    }
+    Ok(report)
+}
+
+#[cfg(not(feature = "gpu"))]
+fn kernels(_: &[u16]) -> Result<serde_json::Value> {
+    let text = "--kernels: this program runs no kernels on a GPU; build it with --features gpu";
+    Err(CliError::Input(text.into()))
 }
 
 /// Fails if no device can be used.

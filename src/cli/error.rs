@@ -1,6 +1,7 @@
 //! Errors of commands, with their exit codes.
 
 use std::fmt::Display;
+use std::fs::File;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -57,6 +58,14 @@ impl CliError {
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
     }
+}
+
+/// Opens a file that the user names.
+pub fn open_input(path: &Path) -> Result<File> {
+    formats::open_file(path).map_err(|error| match error {
+        FormatError::Io { source, .. } => CliError::file("read", path, &source),
+        other => CliError::Input(format!("{}: {other}", path.display())),
+    })
 }
 
 impl From<ReconError> for CliError {

@@ -90,7 +90,7 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
     };
     let lab = store.job_of_any_lab(id).await?.lab;
     let change = Change { action: name, lab: Some(lab.clone()), object: id.to_string() };
-    audited(log, change, async { Ok(alter(store, &lab, action).await?) }).await?;
+    audited(store, log, change, async || alter(store, &lab, action).await).await?;
     if matches!(action, Action::Delete { .. }) {
         return Ok(format!("deleted {id} of {lab}"));
     }

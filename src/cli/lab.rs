@@ -107,24 +107,25 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
         Action::Uploads { lab } => return uploads(store, lab).await,
         Action::DeleteUpload { lab, sha256 } => {
             let change = change("lab delete-upload", lab, sha256.to_string());
-            audited(log, change, async { Ok(store.delete_upload(lab, *sha256).await?) }).await?;
+            audited(store, log, change, async || store.delete_upload(lab, *sha256).await).await?;
             return Ok(format!("deleted {sha256} of {lab}"));
         }
         Action::Remove { lab } => {
             let change = change("lab remove", lab, lab.to_string());
-            audited(log, change, async { Ok(store.remove_lab(lab).await?) }).await?;
+            audited(store, log, change, async || store.remove_lab(lab).await).await?;
             return Ok(format!("removed {lab}"));
         }
         Action::WebhookSecret { lab, new } => {
             if !store.knows_lab(lab).await? && *lab != Lab::local() {
                 return Err(CliError::Input(format!("there is no lab {lab}")));
             }
-            let read = async { Ok(store.webhook_secret(lab, *new).await?) };
+            let read = async || store.webhook_secret(lab, *new).await;
             let secret = match new {
                 true => {
-                    audited(log, change("lab webhook-secret", lab, lab.to_string()), read).await
+                    audited(store, log, change("lab webhook-secret", lab, lab.to_string()), read)
+                        .await
                 }
-                false => read.await,
+                false => read().await.map_err(CliError::from),
             };
             return Ok(secret_text(&secret?));
         }
@@ -139,7 +140,7 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
                 max_jobs: jobs.map(|limit| limit.0),
             };
             let change = change("lab set", lab, lab.to_string());
-            audited(log, change, async { Ok(store.entitle(lab, entitlement).await?) }).await?;
+            audited(store, log, change, async || store.entitle(lab, entitlement).await).await?;
         }
     }
     let (mut rows, costs) = (Vec::new(), store.cost_left_by_lab().await?);

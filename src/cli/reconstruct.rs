@@ -1,6 +1,6 @@
 //! `sci-recon reconstruct`: reconstructs snapshots without a server.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::BufWriter;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -13,34 +13,34 @@ use serde::Serialize;
 
 use super::CliError;
 use super::arguments::{
-    DispersionArguments, NetworkArguments, ScheduleArguments, Snapshots, axes, frame_range, mosaic,
-    packing, registration, sequence,
+    DispersionArguments, MaskFileArguments, NetworkArguments, ScheduleArguments,
+    SnapshotFileArguments, Snapshots, named, registration,
 };
 use super::fields::Role;
 use super::model::{Model, cut};
 use super::output::print_line;
 use super::progress::SnapshotBar;
 use super::verdict;
-use crate::cli::error::Result;
+use crate::cli::error::{Result, open_input};
 use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Dispersion, Finding, MaskOrder, Mosaic, Registered, RegistrationRequest,
+    Algorithm, Assessment, Dispersion, Finding, Mosaic, Registered, RegistrationRequest,
     SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
 };
 use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
-use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, Summary, TileRecord, changes};
+use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, TileRecord, changes};
 use engine::pipeline::registration;
 use engine::pipeline::scale::{Histogram, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{check_output, replace_result, write_result};
 use formats::mat::SceneArray;
-use formats::{Axes, Channels, Crop, Limits, Packing, Part, planar};
+use formats::{Axes, Channels, Limits, Part, planar};
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::{TilePlan, Window};
 
@@ -66,17 +66,8 @@ pub struct Arguments {
     snapshots: Snapshots,
     /// `contiguous` if the snapshots follow one another without a gap; they are reconstructed together where that helps.
     /// `separate` reconstructs each alone.
-    #[arg(long, default_value_t = Sequence::Contiguous, value_parser = sequence())]
+    #[arg(long, default_value_t = Sequence::Contiguous, value_parser = named::<Sequence>())]
     sequence: Sequence,
-    /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
-    #[arg(long, value_name = "FILE")]
-    dark: Vec<PathBuf>,
-    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
-    #[arg(long, value_name = "FILE")]
-    bad_pixels: Option<PathBuf>,
-    /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
-    #[arg(long, value_name = "NUMBER")]
-    saturation: Option<u32>,
     /// Value in the masks' file that means 1 (fully open) [default: 255 for uint8, 65535 for
     /// uint16, 1 for floats and .mat scenes].
     #[arg(long, value_name = "VALUE")]
@@ -90,39 +81,16 @@ pub struct Arguments {
     truth_full_scale: Option<f32>,
     /// The colours of the sensor's pixels, row by row of a 2x2 cell. The frames then have colours; the truth may have
     /// colours ([frame, row, column, 3]) or be a mosaic [default: a grey sensor].
-    #[arg(long, value_name = "NAME", value_parser = mosaic())]
+    #[arg(long, value_name = "NAME", value_parser = named::<Mosaic>())]
     mosaic: Option<Mosaic>,
-    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
-    #[arg(long, value_name = "NAME")]
-    masks_array: Option<String>,
-    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
-    #[arg(long, value_name = "NAME")]
-    array: Option<String>,
+    #[command(flatten)]
+    mask_file: MaskFileArguments,
+    #[command(flatten)]
+    snapshot_file: SnapshotFileArguments,
     #[command(flatten)]
     dispersion: DispersionArguments,
-    /// The order of the axes in the masks' file [default: the only one that fits].
-    #[arg(long, value_name = "ORDER", value_parser = axes())]
-    masks_axes: Option<Axes>,
-    /// Window of each mask: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole masks].
-    #[arg(long, value_name = "WINDOW")]
-    masks_crop: Option<Crop>,
-    /// First and last mask, both included, counted from 0 [default: all masks].
-    #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
-    masks_frames: Option<(usize, usize)>,
-    /// How the pixels of the masks are packed [default: one number per pixel].
-    #[arg(long, value_name = "NAME", value_parser = packing())]
-    masks_packing: Option<Packing>,
-    /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
-    #[arg(long, alias = "measurement-crop", value_name = "WINDOW")]
-    crop: Option<Crop>,
-    /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
-    #[arg(long, alias = "measurement-packing", value_name = "NAME", value_parser = packing())]
-    packing: Option<Packing>,
-    /// The order of the axes in the measurement's file.
-    #[arg(long, alias = "measurement-axes", value_name = "ORDER", value_parser = axes())]
-    axes: Option<Axes>,
     /// The order of the axes in the truth's file.
-    #[arg(long, value_name = "ORDER", value_parser = axes())]
+    #[arg(long, value_name = "ORDER", value_parser = named::<Axes>())]
     truth_axes: Option<Axes>,
     /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
     /// it in pixels.
@@ -152,8 +120,8 @@ pub struct Arguments {
     #[arg(long, value_name = "PIXELS")]
     overlap: Option<usize>,
     /// Folder for frames/, png/, stack.exr, frames.npy (and mosaic.npy) and manifest.json. Several snapshots have a
-    /// subfolder each, snapshot_0000 and so on.
-    #[arg(long, value_name = "FOLDER")]
+    /// subfolder each, snapshot_0000 and so on. Without it, the result is only measured.
+    #[arg(long, value_name = "FOLDER", required_unless_present_any = ["truth", "scene", "json"])]
     out: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
@@ -174,6 +142,7 @@ struct Setup {
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
     let network = arguments.engine.network()?.with_models(arguments.models.clone());
+    let schedule = network.suited(schedule);
     let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
@@ -222,8 +191,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let uses_network = setup.model.is_some() || setup.schedule.needs_network();
     let records_version = uses_network && arguments.out.is_some();
     let cost = CostRecord {
-        provider: uses_network.then(|| setup.network.provider().into()),
+        provider: uses_network.then(|| setup.network.provider(&setup.schedule).into()),
         onnxruntime: if records_version { Some(setup.network.version()?) } else { None },
+        gpu: setup.network.gpu_name(&setup.schedule),
         cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };
@@ -314,11 +284,14 @@ impl<'a> Sources<'a> {
                 SceneArray::Masks,
                 arguments.masks_full_scale,
             )
-            .named(arguments.masks_array.clone())
-            .arranged(arguments.masks_axes, None)
+            .named(arguments.mask_file.masks_array.clone())
+            .arranged(arguments.mask_file.masks_axes, None)
             .part(
-                Part { crop: arguments.masks_crop, frames: arguments.masks_frames },
-                arguments.masks_packing,
+                Part {
+                    crop: arguments.mask_file.masks_crop,
+                    frames: arguments.mask_file.masks_frames,
+                },
+                arguments.mask_file.masks_packing,
             )
             .dispersed(dispersion),
             measurement: Source::file(
@@ -326,9 +299,12 @@ impl<'a> Sources<'a> {
                 SceneArray::Measurements,
                 arguments.full_scale,
             )
-            .named(arguments.array.clone())
-            .arranged(arguments.axes, None)
-            .part(Part { crop: arguments.crop, frames: None }, arguments.packing),
+            .named(arguments.snapshot_file.array.clone())
+            .arranged(arguments.snapshot_file.axes, None)
+            .part(
+                Part { crop: arguments.snapshot_file.crop, frames: None },
+                arguments.snapshot_file.packing,
+            ),
             truth: named(&arguments.truth).map(|path| {
                 Source::file(path, SceneArray::Truth, arguments.truth_full_scale)
                     .arranged(arguments.truth_axes, None)
@@ -338,7 +314,7 @@ impl<'a> Sources<'a> {
 }
 
 fn sha256(path: &Path) -> Result<Sha256> {
-    let hashed = File::open(path).and_then(|mut file| Sha256::of_reader(&mut file));
+    let hashed = Sha256::of_reader(&mut open_input(path)?);
     Ok(hashed.map_err(|error| CliError::file("read", path, &error))?.0)
 }
 
@@ -359,7 +335,7 @@ struct Input<'a> {
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let mut sources = Sources::new(arguments)?;
-        let mut masks = read_masks(&sources.masks, arguments.bad_pixels.as_deref())
+        let mut masks = read_masks(&sources.masks, arguments.mask_file.bad_pixels.as_deref())
             .map_err(|error| CliError::from(error).about(Role::Masks))?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
@@ -370,7 +346,7 @@ impl<'a> Input<'a> {
             truth.size = Some(frame_size);
         }
         let Snapshots { first, last } = arguments.snapshots;
-        let Arguments { dark, saturation, .. } = arguments;
+        let SnapshotFileArguments { dark, saturation, .. } = &arguments.snapshot_file;
         let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
         let behind =
             Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
@@ -398,7 +374,7 @@ impl<'a> Input<'a> {
             )));
         }
         let mosaic = arguments.mosaic;
-        let crops = [arguments.masks_crop, arguments.crop];
+        let crops = [arguments.mask_file.masks_crop, arguments.snapshot_file.crop];
         if mosaic.is_some() && !crops.into_iter().all(keeps_mosaic) {
             let text = "--mosaic: the window of a mosaic starts at an even row and an even column";
             return Err(CliError::Input(text.into()));
@@ -617,7 +593,7 @@ impl Report {
         let SceneShape { height, width, .. } = recipe.shape.frame_shape(recipe.dispersion.as_ref());
         let snapshots = input.measurement.dim().0;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
-        let summary = Summary::of(&tiles);
+        let summary = TileRecord::summary(&tiles);
         let white_level = recipe.scale.white_level;
         let psnr_unit_db = quality.as_ref().map(|quality| quality.psnr);
         let quality = quality.map(|quality| quality.relative_to(white_level));
@@ -672,9 +648,6 @@ impl Report {
             self.stop_reason
         ))?;
         print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
-        if self.assessment.as_ref().and_then(|one| one.order) == Some(MaskOrder::NotVerifiable) {
-            print_line("order of masks not verifiable: the scene moves too little or too fast")?;
-        }
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(

@@ -10,7 +10,7 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use serde::Serialize;
 
 use super::CliError;
-use super::arguments::{DispersionArguments, mosaic};
+use super::arguments::{DispersionArguments, named};
 use super::masks::{Apertures, MaskArguments, SimulatedMasks};
 use super::optics::OpticsFile;
 use crate::cli::error::Result;
@@ -26,7 +26,7 @@ pub struct Arguments {
     frames: PathBuf,
     /// The colours of the sensor's pixels, row by row of a 2x2 cell. The scene must then have colours: npy [frame, row,
     /// column, 3] or a folder of colour PNGs [default: a grey sensor].
-    #[arg(long, value_name = "NAME", value_parser = mosaic())]
+    #[arg(long, value_name = "NAME", value_parser = named::<Mosaic>())]
     mosaic: Option<Mosaic>,
     #[command(flatten)]
     dispersion: DispersionArguments,

@@ -2,27 +2,27 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{ArgGroup, Args};
 use serde_json::{Map, Value, json};
 
 use super::CliError;
 use super::arguments::{
-    DispersionArguments, Snapshots, axes, frame_range, mosaic, named_all, packing, registration,
-    sequence,
+    DispersionArguments, MaskFileArguments, SnapshotFileArguments, Snapshots, named, named_all,
+    registration,
 };
 use super::client::{Client, Result};
 use super::fields::Role;
 use engine::job::{
     Algorithm, CalibrationId, Dispersion, JobId, Mosaic, RegistrationRequest, Sequence, Sha256,
 };
-use formats::{Axes, Crop, Packing};
 
 /// Options of the calibration, the measurement and the job.
 #[derive(Debug, Args)]
+#[command(group = ArgGroup::new("camera").args(["masks", "calibration", "registration_of"]).required(true).multiple(true))]
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
-    #[arg(long, value_name = "ID", required_unless_present_any = ["masks", "registration_of"],
-          help_heading = CALIBRATION)]
+    #[arg(long, value_name = "ID", help_heading = CALIBRATION,
+          conflicts_with_all = ["masks_array", "masks_axes", "masks_crop", "masks_frames", "masks_packing", "bad_pixels"])]
     calibration: Option<CalibrationId>,
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
@@ -32,24 +32,8 @@ pub(super) struct SubmissionArguments {
           conflicts_with_all = ["calibration", "masks", "masks_array", "masks_axes", "masks_crop", "masks_frames",
                                 "masks_packing", "masks_full_scale", "mosaic", "bad_pixels"])]
     registration_of: Option<JobId>,
-    /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
-    #[arg(long, value_name = "NAME", conflicts_with = "calibration", help_heading = CALIBRATION)]
-    masks_array: Option<String>,
-    /// The order of the axes of the masks [default: the only one that fits].
-    #[arg(long, value_name = "ORDER", conflicts_with = "calibration", value_parser = axes(),
-          help_heading = CALIBRATION)]
-    masks_axes: Option<Axes>,
-    /// Window of each mask: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole masks].
-    #[arg(long, value_name = "WINDOW", conflicts_with = "calibration", help_heading = CALIBRATION)]
-    masks_crop: Option<Crop>,
-    /// First and last mask, both included, counted from 0 [default: all masks].
-    #[arg(long, value_name = "FIRST-LAST", conflicts_with = "calibration", value_parser = frame_range,
-          help_heading = CALIBRATION)]
-    masks_frames: Option<(usize, usize)>,
-    /// How the pixels of the masks are packed [default: one number per pixel].
-    #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = packing(),
-          help_heading = CALIBRATION)]
-    masks_packing: Option<Packing>,
+    #[command(flatten, next_help_heading = CALIBRATION)]
+    mask_file: MaskFileArguments,
     /// The stored number in the masks that means 1, fully open [default: that of their type].
     #[arg(long, value_name = "NUMBER", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_full_scale: Option<f64>,
@@ -57,32 +41,13 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "TEXT", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks_name: Option<String>,
     /// The colours of the sensor's pixels, row by row of a 2x2 cell [default: a grey sensor].
-    #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = mosaic(),
+    #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = named::<Mosaic>(),
           help_heading = CALIBRATION)]
     mosaic: Option<Mosaic>,
     #[command(flatten, next_help_heading = CALIBRATION)]
     dispersion: DispersionArguments,
-    /// Map of the sensor's bad pixels, of the size of the masks: they are those that are not 0.
-    #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
-    bad_pixels: Option<PathBuf>,
-    /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
-    #[arg(long, value_name = "NAME", help_heading = MEASUREMENT)]
-    array: Option<String>,
-    /// The order of the axes of the snapshots [default: the only one that fits].
-    #[arg(long, value_name = "ORDER", value_parser = axes(), help_heading = MEASUREMENT)]
-    axes: Option<Axes>,
-    /// Window of each snapshot and dark capture: ROW,COLUMN,HEIGHT,WIDTH, counted from 0 [default: whole snapshots].
-    #[arg(long, value_name = "WINDOW", help_heading = MEASUREMENT)]
-    crop: Option<Crop>,
-    /// How the pixels of snapshots and dark captures are packed [default: one number per pixel].
-    #[arg(long, value_name = "NAME", value_parser = packing(), help_heading = MEASUREMENT)]
-    packing: Option<Packing>,
-    /// Captures of the dark at the exposure of the snapshots; their average is subtracted. May be repeated.
-    #[arg(long, value_name = "FILE", help_heading = MEASUREMENT)]
-    dark: Vec<PathBuf>,
-    /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
-    #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
-    saturation: Option<u32>,
+    #[command(flatten, next_help_heading = MEASUREMENT)]
+    snapshot_file: SnapshotFileArguments,
     /// The stored number in the snapshots that means 1 [default: that of their type].
     #[arg(long, value_name = "NUMBER", help_heading = MEASUREMENT)]
     full_scale: Option<f64>,
@@ -94,7 +59,7 @@ pub(super) struct SubmissionArguments {
     exposure_s: Option<f64>,
     /// `contiguous` if the snapshots follow one another without a gap, else `separate` [default: the camera's
     /// times decide].
-    #[arg(long, value_name = "KIND", value_parser = sequence(), help_heading = MEASUREMENT)]
+    #[arg(long, value_name = "KIND", value_parser = named::<Sequence>(), help_heading = MEASUREMENT)]
     sequence: Option<Sequence>,
     /// Name of the measurement [default: none].
     #[arg(long, value_name = "TEXT", help_heading = MEASUREMENT)]
@@ -150,7 +115,11 @@ pub(super) struct Recipe {
 impl SubmissionArguments {
     /// Files that belong to each snapshot: the masks, the map of bad pixels, the dark captures and the true frames.
     pub(super) fn own_files(&self) -> impl Iterator<Item = &PathBuf> {
-        self.masks.iter().chain(&self.bad_pixels).chain(&self.dark).chain(&self.truth)
+        self.masks
+            .iter()
+            .chain(&self.mask_file.bad_pixels)
+            .chain(&self.snapshot_file.dark)
+            .chain(&self.truth)
     }
 
     /// Uploads masks, dark captures and true frames, creates the calibration if necessary, and returns the requests.
@@ -170,7 +139,7 @@ impl SubmissionArguments {
             }
             (Some(id), ..) => id.to_string(),
             (None, Some(masks), _) => {
-                let bad_pixels = match &self.bad_pixels {
+                let bad_pixels = match &self.mask_file.bad_pixels {
                     Some(map) => Some(client.upload_with_bar(map).await?),
                     None => None,
                 };
@@ -199,8 +168,8 @@ impl SubmissionArguments {
 
     /// Uploads the dark captures that the service does not have, or has deleted as unused.
     pub(super) async fn send_dark(&self, client: &Client) -> Result<Vec<Sha256>> {
-        let mut sent = Vec::with_capacity(self.dark.len());
-        for dark in &self.dark {
+        let mut sent = Vec::with_capacity(self.snapshot_file.dark.len());
+        for dark in &self.snapshot_file.dark {
             sent.push(client.upload_with_bar(dark).await?);
         }
         Ok(sent)
@@ -213,11 +182,11 @@ impl SubmissionArguments {
         dispersion: Option<Dispersion>,
     ) -> Value {
         let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
-        add(&mut body, "array", json!(self.masks_array));
-        add(&mut body, "axes", json!(self.masks_axes));
-        add(&mut body, "crop", json!(self.masks_crop));
-        add(&mut body, "frames", json!(self.masks_frames));
-        add(&mut body, "packing", json!(self.masks_packing));
+        add(&mut body, "array", json!(self.mask_file.masks_array));
+        add(&mut body, "axes", json!(self.mask_file.masks_axes));
+        add(&mut body, "crop", json!(self.mask_file.masks_crop));
+        add(&mut body, "frames", json!(self.mask_file.masks_frames));
+        add(&mut body, "packing", json!(self.mask_file.masks_packing));
         add(&mut body, "full_scale", json!(self.masks_full_scale));
         add(&mut body, "mosaic", json!(self.mosaic));
         add(&mut body, "dispersion", json!(dispersion));
@@ -229,12 +198,12 @@ impl SubmissionArguments {
     /// A request for a measurement, without its data.
     fn measurement_request(&self, calibration: &str, dark: &[Sha256]) -> Map<String, Value> {
         let mut body = Map::from_iter([("calibration".to_owned(), json!(calibration))]);
-        add(&mut body, "array", json!(self.array));
-        add(&mut body, "axes", json!(self.axes));
-        add(&mut body, "crop", json!(self.crop));
-        add(&mut body, "packing", json!(self.packing));
+        add(&mut body, "array", json!(self.snapshot_file.array));
+        add(&mut body, "axes", json!(self.snapshot_file.axes));
+        add(&mut body, "crop", json!(self.snapshot_file.crop));
+        add(&mut body, "packing", json!(self.snapshot_file.packing));
         add(&mut body, "dark", if dark.is_empty() { Value::Null } else { json!(dark) });
-        add(&mut body, "saturation", json!(self.saturation));
+        add(&mut body, "saturation", json!(self.snapshot_file.saturation));
         add(&mut body, "full_scale", json!(self.full_scale));
         add(&mut body, "camera_fps", json!(self.camera_fps));
         add(&mut body, "exposure_s", json!(self.exposure_s));

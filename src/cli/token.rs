@@ -104,7 +104,11 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
             let id = TokenId::new();
             let object = id.to_string();
             let change = Change { action: "token create", lab: Some(create.lab.clone()), object };
-            audited(log, change, make(store, id, create)).await
+            let secret = Secret::random()
+                .map_err(|error| CliError::Failure(format!("no random numbers: {error}")))?;
+            let token = create.token(id);
+            audited(store, log, change, async || store.add_token(&token, &secret).await).await?;
+            Ok(secret.reveal().to_owned())
         }
         Action::List => Ok(table(&store.tokens().await?)),
         Action::Revoke { id } => {
@@ -112,29 +116,27 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
             let token = tokens.into_iter().map(|(token, _)| token).find(|token| token.id == *id);
             let lab = token.map(|token| token.lab);
             let change = Change { action: "token revoke", lab, object: id.to_string() };
-            audited(log, change, async { Ok(store.revoke_token(*id).await?) }).await?;
+            audited(store, log, change, async || store.revoke_token(*id).await).await?;
             Ok(format!("revoked {id}"))
         }
     }
 }
 
-async fn make(store: &Store, id: TokenId, create: &Create) -> Result<String> {
-    let secret = Secret::random()
-        .map_err(|error| CliError::Failure(format!("no random numbers: {error}")))?;
-    let token = Token {
-        id,
-        lab: create.lab.clone(),
-        role: create.role,
-        all_labs: create.all_labs,
-        note: create.note.clone(),
-        max_bytes: create.max_bytes,
-        created_at: Timestamp::now(),
-        expires_at: create.expires,
-        used_at: None,
-        revoked_at: None,
-    };
-    store.add_token(&token, &secret).await?;
-    Ok(secret.reveal().to_owned())
+impl Create {
+    fn token(&self, id: TokenId) -> Token {
+        Token {
+            id,
+            lab: self.lab.clone(),
+            role: self.role,
+            all_labs: self.all_labs,
+            note: self.note.clone(),
+            max_bytes: self.max_bytes,
+            created_at: Timestamp::now(),
+            expires_at: self.expires,
+            used_at: None,
+            revoked_at: None,
+        }
+    }
 }
 
 /// Parses a time in the future, or a number of days or hours from now.

@@ -7,7 +7,7 @@ use super::CliError;
 use super::client::Job;
 use super::error::Result;
 use super::fields::{as_options, role_of};
-use engine::job::{Assessment, Finding, Grade, JobState, Severity};
+use engine::job::{Assessment, Finding, Grade, JobState, MaskOrder, Severity};
 
 /// Snapshots after the first that the line of a finding lists. Further ones are counted.
 const NAMED_SNAPSHOTS: usize = 8;
@@ -51,13 +51,13 @@ fn line(finding: &Finding, snapshots: &[u32]) -> String {
     format!("{severity} {code}: {prefix}{detail}. Remedy: {remedy}.")
 }
 
-/// The grade, with the expected PSNR if it can be predicted.
+/// The grade, with the expected PSNR if it can be predicted, and whether the order of the masks was verified.
 pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> String {
     match assessment {
-        Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, .. }) => {
+        Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, order, .. }) => {
             let grade = grade.into_str();
             let best = Assessment::MAX_PSNR_DB;
-            match (psnr_db, psnr_low_db, psnr_high_db) {
+            let mut text = match (psnr_db, psnr_low_db, psnr_high_db) {
                 (Some(psnr), Some(low), Some(high)) if *psnr < best => {
                     format!("{grade}, expected PSNR {psnr:.1} dB ({low:.1} to {high:.1})")
                 }
@@ -66,7 +66,11 @@ pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> 
                 }
                 (Some(_), ..) => format!("{grade}, expected PSNR {best:.0} dB or more"),
                 (None, ..) => format!("{grade}, no expected PSNR"),
+            };
+            if *order == Some(MaskOrder::NotVerifiable) {
+                text += "; order of masks not verifiable: the scene moves too little or too fast";
             }
+            text
         }
         None if !errors(findings).is_empty() => "bad".to_owned(),
         None => "not assessed".to_owned(),
@@ -101,7 +105,9 @@ pub(super) fn refuse_bad<'a>(
     }
     let codes: Vec<&str> = codes.into_iter().collect();
     match codes.as_slice() {
-        [] if is_bad => Err(CliError::ErrorsFound("the verdict is bad".into())),
+        [] if is_bad => Err(CliError::ErrorsFound(
+            "the verdict is bad: the expected PSNR is too low; see docs/DATA.md, section Expected PSNR".into(),
+        )),
         [] => Ok(()),
         _ => {
             let text = format!("the checks found {}: results will be wrong", codes.join(", "));
@@ -133,7 +139,7 @@ impl Job {
 #[cfg(test)]
 mod tests {
     use super::{lines, refuse_bad, verdict};
-    use engine::job::{Assessment, Finding, Grade, Severity};
+    use engine::job::{Assessment, Finding, Grade, MaskOrder, Severity};
 
     fn finding(code: &str, severity: Severity, snapshot: Option<u32>) -> Finding {
         let (code, detail, remedy) = (code.to_owned(), "light is missing".into(), "add it.".into());
@@ -182,6 +188,8 @@ mod tests {
         };
         let text = verdict(Some(&assessment), &[]);
         assert_eq!(text, "usable, expected PSNR 31.2 dB (29.8 to 32.9)");
+        let unordered = Assessment { order: Some(MaskOrder::NotVerifiable), ..assessment.clone() };
+        assert!(verdict(Some(&unordered), &[]).contains("32.9); order of masks not verifiable"));
         let at = |psnr, low| Assessment {
             psnr_db: Some(psnr),
             psnr_low_db: Some(low),

@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::CliError;
 use super::output::print_line;
+use super::wait::wait;
 use crate::cli::error::Result;
 use store::{Audit, Purpose, Store};
 
@@ -22,9 +23,7 @@ pub struct Arguments {
 
 /// Verifies the folder, and prints the result as one JSON line.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-    let runtime = runtime.map_err(|error| CliError::Failure(error.to_string()))?;
-    let audit = runtime.block_on(async {
+    let audit = wait(async {
         let store = Store::open(&arguments.data, Purpose::Use).await?;
         let audit = store.verify().await?;
         store.close().await;

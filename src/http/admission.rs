@@ -25,7 +25,7 @@ pub(super) struct Admission {
     max_upload_bytes: u64,
     min_free_bytes: u64,
     incoming: Incoming,
-    places: Places,
+    places: Places<Lab>,
     /// Held from the look at the disk until what was let in is on record: of two that want the last room one
     /// gets it.
     gate: Mutex<()>,
@@ -76,13 +76,13 @@ impl Admission {
             max_upload_bytes: settings.max_upload_bytes,
             min_free_bytes: settings.min_free_bytes,
             incoming: Incoming::default(),
-            places: Places::new(settings.max_uploads),
+            places: Places::for_labs(settings.max_uploads),
             gate: Mutex::default(),
         }
     }
 
     /// Takes one of the places for uploads.
-    pub(super) fn place(&self, lab: &Lab) -> Result<Place> {
+    pub(super) fn place(&self, lab: &Lab) -> Result<Place<Lab>> {
         self.places.take(lab).map_err(|full| {
             let detail =
                 "all places for uploads are taken, or this lab has its share; try again soon";

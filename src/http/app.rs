@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::extract::FromRef;
+use quick_cache::sync::Cache;
 use tokio::sync::{Mutex, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -19,6 +20,7 @@ use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
 use crate::config::{DeviceState, ServeArguments};
 use engine::job::{Timestamp, TokenId, without_paths};
+use engine::pipeline::quality::Quality;
 use formats::Limits;
 use store::Store;
 
@@ -28,6 +30,9 @@ const READS_AT_ONCE: usize = 4;
 const SESSIONS_PER_MINUTE: u32 = 20;
 /// Requests of a lab that may wait for a file to be read.
 const READS: usize = 32;
+
+/// Number of comparisons that are kept.
+const KEPT_QUALITIES: usize = 1000;
 
 /// What all handlers share; cheap to clone.
 #[derive(Debug, Clone)]
@@ -55,6 +60,8 @@ pub struct Services {
     /// The rate at which each token begins sessions.
     pub(super) session_rates: Rates<TokenId>,
     pub(super) pictures: Pictures,
+    /// Comparisons by frames, truth and its reading, because a list of jobs asks for the same ones again and again.
+    pub(super) qualities: Cache<String, Quality>,
     pub(super) machine: Machine,
 }
 
@@ -83,6 +90,7 @@ impl App {
             revocations: Revocations::start(store.clone()),
             session_rates: Rates::new(SESSIONS_PER_MINUTE),
             pictures: Pictures::new(),
+            qualities: Cache::new(KEPT_QUALITIES),
             started_at: Timestamp::now(),
             limits: Limits { max_file_bytes: settings.max_upload_bytes, ..Limits::default() },
             admission: Admission::new(store.clone(), settings),
@@ -125,6 +133,14 @@ impl App {
 pub(super) const WORKER_AGE: Duration = Duration::from_secs(15);
 
 impl App {
+    /// True if a live worker, or those of this service, use a GPU.
+    pub(super) async fn has_gpu(&self) -> Result<bool> {
+        let workers = self.store.live_workers(WORKER_AGE).await?;
+        let devices = workers.iter().filter_map(|worker| worker.place.device.as_deref());
+        let mut devices = devices.chain([&*self.settings.engine.device]);
+        Ok(devices.any(|device| device != "cpu"))
+    }
+
     /// The problem in words if no worker takes tiles. A service that has just started has time to start its workers.
     pub(super) async fn tiles(&self) -> Result<std::result::Result<(), String>> {
         if self.store.live_tile_workers(WORKER_AGE).await? > 0 {

@@ -9,8 +9,8 @@ use flate2::Compression;
 use flate2::read::GzDecoder;
 use flate2::write::GzEncoder;
 
-use super::conditional;
 use super::error::Result;
+use super::{conditional, negotiation};
 use engine::job::Sha256;
 
 /// A document in two representations, each with its own strong ETag.
@@ -64,7 +64,7 @@ impl Asset {
 
     /// The representation that the client takes, 304 or 412.
     pub(super) fn answer(&self, headers: &HeaderMap) -> Result<Response> {
-        let gzip = takes_gzip(headers);
+        let gzip = negotiation::takes_gzip(headers);
         let file = if gzip { &self.packed } else { &self.plain };
         conditional::check_match(headers, &file.etag)?;
         let known = conditional::is_known(headers, &file.etag);
@@ -95,39 +95,5 @@ impl Asset {
         let policy = HeaderValue::from_static(policy);
         response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
         Ok(response)
-    }
-}
-
-/// True if the client lists gzip and does not rule it out.
-fn takes_gzip(headers: &HeaderMap) -> bool {
-    let lists = headers.get_all(header::ACCEPT_ENCODING).iter().filter_map(|v| v.to_str().ok());
-    lists.flat_map(|list| list.split(',')).any(|item| {
-        let (coding, weight) = item.split_once(';').unwrap_or((item, ""));
-        let weight: String = weight.split_whitespace().collect();
-        let refused = weight.strip_prefix("q=").is_some_and(|q| q.parse() == Ok(0.0f32));
-        coding.trim().eq_ignore_ascii_case("gzip") && !refused
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::takes_gzip;
-    use axum::http::HeaderMap;
-
-    #[test]
-    fn gzip_is_sent_only_to_clients_that_accept_it() {
-        let takes = |value: &str| {
-            takes_gzip(&HeaderMap::from_iter([(
-                "accept-encoding".parse().unwrap(),
-                value.parse().unwrap(),
-            )]))
-        };
-        for yes in ["gzip", "gzip, deflate, br", "br, GZIP;q=0.5", "deflate;q=0, gzip; q=1"] {
-            assert!(takes(yes), "{yes}");
-        }
-        for no in ["", "br", "gzip;q=0", "gzip; q=0.0", "x-gzipped"] {
-            assert!(!takes(no), "{no}");
-        }
-        assert!(!takes_gzip(&HeaderMap::new()));
     }
 }

@@ -19,7 +19,7 @@ use super::extract::{Caller, Params, QueryOf, check_digest, check_encoding, cont
 use super::page::{Cursor, Limit, PageBody};
 use super::shares;
 use super::upload;
-use engine::job::{Sha256, Timestamp};
+use engine::job::{Lab, Sha256, Timestamp};
 use store::{Blob, BlobRow, StagedBlob};
 
 /// `POST /v1/blobs`: stores a file, sent as the raw body or as the field `file` of a form.
@@ -151,7 +151,7 @@ async fn begin(
     app: &App,
     access: &Access,
     headers: &HeaderMap,
-) -> Result<(shares::Place, Reservation)> {
+) -> Result<(shares::Place<Lab>, Reservation)> {
     check_encoding(headers)?;
     check_whole(headers)?;
     content_digest(headers)?;

@@ -46,6 +46,7 @@ mod tests {
     use super::super::error::Problem;
     use super::super::jobs::JobBody;
     use super::super::measurements::MeasurementBody;
+    use super::super::models::ModelBody;
     use super::super::page::PageBody;
     use super::super::pictures::SpreadBody;
     use super::super::router::routes;
@@ -58,7 +59,7 @@ mod tests {
     use engine::job::{
         CalibrationReport, CalibrationRequest, JobRequest, MeasurementRequest, ModelRequest,
     };
-    use store::{Blob, BlobRow, Model, TileHistory};
+    use store::{Blob, BlobRow, TileHistory};
 
     const PROSE: &str = include_str!("contract.yaml");
     const METHODS: [&str; 7] = ["get", "head", "post", "put", "patch", "delete", "options"];
@@ -136,6 +137,7 @@ mod tests {
             .into_iter()
             .map(|(status, answer)| (status.as_str().unwrap().to_owned(), response(answer)))
             .collect();
+        let is_picture = answers.get("200") == Some(&reference("responses", "Picture"));
         let mut may = |names: &[(&str, &str)]| {
             for (status, name) in names {
                 answers.entry((*status).to_owned()).or_insert_with(|| reference("responses", name));
@@ -145,6 +147,9 @@ mod tests {
         if guarded {
             may(&[("400", "BadRequest"), ("401", "Unauthorized"), ("403", "Forbidden")]);
             may(&[("404", "NotFound"), ("429", "RateLimited"), ("500", "Internal")]);
+        }
+        if is_picture {
+            may(&[("406", "NotAcceptable")]);
         }
         if matches!(rule, Rule::ByMethod | Rule::AcrossLabs) {
             add(&["Lab"]);
@@ -277,7 +282,7 @@ mod tests {
         let mut schemas = schemas_of! {
             SchemaSettings::draft2020_12().for_serialize();
             me::MeBody, session::SessionBody, labs::ListBody, PageBody<BlobRow>, PageBody<tus::UploadBody>,
-            PageBody<CalibrationBody>, CalibrationReport, PageBody<MeasurementBody>, PageBody<Model>,
+            PageBody<CalibrationBody>, CalibrationReport, PageBody<MeasurementBody>, PageBody<ModelBody>,
             algorithms::ListBody, PageBody<JobBody>, jobs::EstimateBody, samples::SampleBody,
             exports::movie::ExportBody, PageBody<results::SnapshotBody>, quality::QualityBody, tiles::TilesBody,
             TileHistory, SpreadBody, events::Change, system::SystemBody, system::Readiness,
@@ -336,6 +341,11 @@ mod tests {
                 .map(|more| fields.insert("additionalProperties".into(), more));
             if let Some(known) = fields.remove("enum") {
                 fields.insert("x-extensible-enum".into(), known);
+            }
+            // Open values do not exclude one another.
+            if let Some(variants) = fields.remove("oneOf") {
+                fields.insert("anyOf".into(), variants);
+                fields.remove("unevaluatedProperties");
             }
             // A schedule of `learned` has no stages.
             fields.remove("minItems");
@@ -449,6 +459,19 @@ mod tests {
             text == YAML,
             "openapi.yaml is out of date: run SCI_RECON_WRITE_CONTRACT=1 cargo test -p sci-recon --lib contract"
         );
+    }
+
+    /// A stage with the prior `fastdvdnet-int8` fits several variants, because later versions may add names of priors.
+    #[test]
+    fn variants_of_answers_may_overlap() {
+        for (name, schema) in answers() {
+            let text = schema.to_string();
+            assert!(
+                !text.contains("\"oneOf\""),
+                "{name} excludes an answer that fits two variants"
+            );
+            assert!(!text.contains("\"unevaluatedProperties\""), "{name} excludes later fields");
+        }
     }
 
     #[test]

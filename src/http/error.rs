@@ -17,10 +17,10 @@ use store::StoreError;
 static CHECKSUM_STATUS: LazyLock<StatusCode> =
     LazyLock::new(|| StatusCode::from_u16(460).unwrap_or(StatusCode::BAD_REQUEST));
 
-/// Defines the codes of errors from a table: status, title, and whether a retry may succeed. The name of a code is the
-/// variant in snake case. Programs rely on it, so it never changes.
+/// Defines the codes of errors from a table: status, title, whether a retry may succeed, and the meaning with instructions for
+/// the user. The name of a code is the variant in snake case. Programs rely on it, so it never changes.
 macro_rules! codes {
-    ($($code:ident: $status:expr, $title:literal, $retryable:literal;)*) => {
+    ($($code:ident: $status:expr, $title:literal, $retryable:literal, $meaning:literal;)*) => {
         #[derive(Debug, Clone, Copy, PartialEq, Eq, EnumString, IntoStaticStr, VariantArray)]
         #[strum(serialize_all = "snake_case", const_into_str)]
         pub enum Code {
@@ -28,10 +28,10 @@ macro_rules! codes {
         }
 
         impl Code {
-            /// The status, the title, and whether the same request may succeed later.
-            pub(super) fn row(self) -> (StatusCode, &'static str, bool) {
+            /// The status, the title, whether the same request may succeed later, and the meaning.
+            pub(super) fn row(self) -> (StatusCode, &'static str, bool, &'static str) {
                 match self {
-                    $(Self::$code => ($status, $title, $retryable),)*
+                    $(Self::$code => ($status, $title, $retryable, $meaning),)*
                 }
             }
         }
@@ -39,51 +39,108 @@ macro_rules! codes {
 }
 
 codes! {
-    MalformedJson: StatusCode::BAD_REQUEST, "Body is not valid JSON", false;
-    MalformedRequest: StatusCode::BAD_REQUEST, "Request can't be parsed", false;
-    InvalidQuery: StatusCode::BAD_REQUEST, "Invalid query parameter", false;
-    EmptyBody: StatusCode::BAD_REQUEST, "Body is empty", false;
-    Unauthorized: StatusCode::UNAUTHORIZED, "Authentication required", false;
-    Forbidden: StatusCode::FORBIDDEN, "Role of the token is too low", false;
-    ForeignSite: StatusCode::FORBIDDEN, "Request from another site", false;
-    NotFound: StatusCode::NOT_FOUND, "Not found", false;
-    NotReady: StatusCode::NOT_FOUND, "Not ready yet", true;
-    CalibrationNotReady: StatusCode::CONFLICT, "Calibration is not ready", true;
-    MeasurementNotReady: StatusCode::CONFLICT, "Measurement is not ready", true;
-    MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Method not allowed", false;
-    UploadStalled: StatusCode::REQUEST_TIMEOUT, "Upload stalled", true;
-    OffsetMismatch: StatusCode::CONFLICT, "Offset does not match the bytes received so far", false;
-    TusVersion: StatusCode::PRECONDITION_FAILED, "Unsupported version of tus", false;
-    PreconditionFailed: StatusCode::PRECONDITION_FAILED, "Resource has changed", false;
-    UploadBusy: StatusCode::LOCKED, "Upload is locked by another request", true;
-    UploadDamaged: StatusCode::GONE, "Bytes of the upload are lost", false;
-    ChecksumMismatch: *CHECKSUM_STATUS, "Checksum does not match", true;
-    InUse: StatusCode::CONFLICT, "Resource is in use", false;
-    IllegalState: StatusCode::CONFLICT, "Not possible in this state", false;
-    TooLarge: StatusCode::PAYLOAD_TOO_LARGE, "Body is too large", false;
-    UnsupportedMediaType: StatusCode::UNSUPPORTED_MEDIA_TYPE, "Unsupported media type", false;
-    RangeNotSatisfiable: StatusCode::RANGE_NOT_SATISFIABLE, "Range is outside the file", false;
-    InvalidRequest: StatusCode::UNPROCESSABLE_ENTITY, "Invalid request", false;
-    InvalidContent: StatusCode::UNPROCESSABLE_ENTITY, "Invalid file", false;
-    SizeMismatch: StatusCode::UNPROCESSABLE_ENTITY, "Sizes do not match", false;
-    HashMismatch: StatusCode::UNPROCESSABLE_ENTITY, "Hash does not match", true;
-    IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "Idempotency key belongs to another request", false;
-    TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads", true;
-    TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many waiting requests", true;
-    TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Too many files wait for a check", true;
-    RateLimited: StatusCode::TOO_MANY_REQUESTS, "Too many requests", true;
-    QueueFull: StatusCode::TOO_MANY_REQUESTS, "Job queue is full", true;
-    Internal: StatusCode::INTERNAL_SERVER_ERROR, "Internal error", true;
-    TaskFailed: StatusCode::INTERNAL_SERVER_ERROR, "Task failed", true;
-    OutOfMemory: StatusCode::INTERNAL_SERVER_ERROR, "Worker ran out of memory", true;
-    WorkerCrashed: StatusCode::INTERNAL_SERVER_ERROR, "Worker crashed", true;
-    WorkerLost: StatusCode::INTERNAL_SERVER_ERROR, "Workers stopped too often", true;
-    MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "Movie can't be encoded", false;
-    FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "Stored file is damaged", false;
-    Unavailable: StatusCode::SERVICE_UNAVAILABLE, "Service is unavailable", true;
-    TimedOut: StatusCode::SERVICE_UNAVAILABLE, "Request timed out", true;
-    InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "Disk is full", true;
-    QuotaExceeded: StatusCode::FORBIDDEN, "Quota is exceeded", false;
+    MalformedJson: StatusCode::BAD_REQUEST, "Body is not valid JSON", false,
+        "The body is not valid JSON. The detail has the line and the column.";
+    MalformedRequest: StatusCode::BAD_REQUEST, "Request can't be parsed", false,
+        "A header, a form or the body can't be parsed, or the body is incomplete. The detail says which.";
+    InvalidQuery: StatusCode::BAD_REQUEST, "Invalid query parameter", false,
+        "A query parameter is unknown, or its value is invalid.";
+    EmptyBody: StatusCode::BAD_REQUEST, "Body is empty", false,
+        "The request needs a body.";
+    Unauthorized: StatusCode::UNAUTHORIZED, "Authentication required", false,
+        "Send a token as Authorization: Bearer. Unknown, misspelled, expired and revoked tokens get the same \
+         answer. An administrator of the service can create a new token.";
+    Forbidden: StatusCode::FORBIDDEN, "Role of the token is too low", false,
+        "The role of the token is too low. Role read may read, submit may also change, and admin may access all \
+         labs.";
+    ForeignSite: StatusCode::FORBIDDEN, "Request from another site", false,
+        "A service without tokens answers only requests to its own host names, and rejects changes from pages of \
+         other sites. Use the address of the service, create a token, or start the service with --host NAME.";
+    NotFound: StatusCode::NOT_FOUND, "Not found", false,
+        "No resource has this address or identifier, or it belongs to another lab.";
+    NotReady: StatusCode::NOT_FOUND, "Not ready yet", true,
+        "The job or the calibration has not reached this step yet. Its state shows the progress.";
+    CalibrationNotReady: StatusCode::CONFLICT, "Calibration is not ready", true,
+        "The masks of the calibration are still being computed or checked. Wait until its state is ready. A failed \
+         calibration never becomes ready; its error has the reason.";
+    MeasurementNotReady: StatusCode::CONFLICT, "Measurement is not ready", true,
+        "The measurement is still being checked. Wait until its state is ready. A failed measurement never becomes \
+         ready; its problem has the reason.";
+    MethodNotAllowed: StatusCode::METHOD_NOT_ALLOWED, "Method not allowed", false,
+        "The header Allow lists the methods of this address.";
+    NotAcceptable: StatusCode::NOT_ACCEPTABLE, "No acceptable media type", false,
+        "The header Accept excludes all media types that this address has. The detail lists them.";
+    UploadStalled: StatusCode::REQUEST_TIMEOUT, "Upload stalled", true,
+        "The service received no data for too long. Send the file again, preferably as a resumable upload \
+         (/v1/uploads).";
+    OffsetMismatch: StatusCode::CONFLICT, "Offset does not match the bytes received so far", false,
+        "Send HEAD to the upload: Upload-Offset is the offset of the next piece.";
+    TusVersion: StatusCode::PRECONDITION_FAILED, "Unsupported version of tus", false,
+        "Send the header Tus-Resumable: 1.0.0.";
+    PreconditionFailed: StatusCode::PRECONDITION_FAILED, "Resource has changed", false,
+        "The resource has changed since the state that If-Match names. Read it again, and decide whether the change \
+         is still needed.";
+    UploadBusy: StatusCode::LOCKED, "Upload is locked by another request", true,
+        "Another request is writing to this upload. Wait until it ends.";
+    UploadDamaged: StatusCode::GONE, "Bytes of the upload are lost", false,
+        "The received bytes are lost or damaged on the disk of the service. Send the file again.";
+    ChecksumMismatch: *CHECKSUM_STATUS, "Checksum does not match", true,
+        "The piece was damaged in transit. Send it again.";
+    InUse: StatusCode::CONFLICT, "Resource is in use", false,
+        "Other resources refer to this one. Delete those first; the detail counts them.";
+    IllegalState: StatusCode::CONFLICT, "Not possible in this state", false,
+        "The state of the resource does not allow this. For example, a succeeded job can't be cancelled.";
+    TooLarge: StatusCode::PAYLOAD_TOO_LARGE, "Body is too large", false,
+        "The body is larger than the limit in the detail.";
+    UnsupportedMediaType: StatusCode::UNSUPPORTED_MEDIA_TYPE, "Unsupported media type", false,
+        "The header Content-Type or Content-Encoding has an unsupported value. The detail has the right one.";
+    RangeNotSatisfiable: StatusCode::RANGE_NOT_SATISFIABLE, "Range is outside the file", false,
+        "The range begins after the end of the file.";
+    InvalidRequest: StatusCode::UNPROCESSABLE_ENTITY, "Invalid request", false,
+        "Each item of errors names a field and its allowed values.";
+    InvalidContent: StatusCode::UNPROCESSABLE_ENTITY, "Invalid file", false,
+        "The file is invalid. The detail describes the fault; reason is a short name of it.";
+    SizeMismatch: StatusCode::UNPROCESSABLE_ENTITY, "Sizes do not match", false,
+        "Rows, columns or frames of related resources differ.";
+    HashMismatch: StatusCode::UNPROCESSABLE_ENTITY, "Hash does not match", true,
+        "The received bytes have another SHA-256 than the request states. Send them again.";
+    IdempotencyKeyReused: StatusCode::UNPROCESSABLE_ENTITY, "Idempotency key belongs to another request", false,
+        "The key was used for a different request. Use a new key for each new resource.";
+    TooManyUploads: StatusCode::TOO_MANY_REQUESTS, "Too many uploads", true,
+        "The service or the lab has too many uploads at the same time, or too many incomplete resumable uploads. \
+         Retry after the seconds in Retry-After.";
+    TooManyWaiters: StatusCode::TOO_MANY_REQUESTS, "Too many waiting requests", true,
+        "Too many requests of the lab wait for jobs. Send the request without wait, or listen to /v1/events, which \
+         reports changes of all jobs.";
+    TooManyChecks: StatusCode::TOO_MANY_REQUESTS, "Too many files wait for a check", true,
+        "Too many files of the lab wait for a check. Retry when some checks are finished.";
+    RateLimited: StatusCode::TOO_MANY_REQUESTS, "Too many requests", true,
+        "The token has sent more requests than allowed in a minute. Continue after the seconds in Retry-After.";
+    QueueFull: StatusCode::TOO_MANY_REQUESTS, "Job queue is full", true,
+        "Too many jobs are in the queue. Retry later, or cancel some jobs.";
+    Internal: StatusCode::INTERNAL_SERVER_ERROR, "Internal error", true,
+        "The log of the service has the cause, under the identifier of the request.";
+    TaskFailed: StatusCode::INTERNAL_SERVER_ERROR, "Task failed", true,
+        "Fix the cause in the detail, then retry the job.";
+    OutOfMemory: StatusCode::INTERNAL_SERVER_ERROR, "Worker ran out of memory", true,
+        "Use smaller tiles, fewer workers or a machine with more memory, then retry the job.";
+    WorkerCrashed: StatusCode::INTERNAL_SERVER_ERROR, "Worker crashed", true,
+        "Retry the job. If the worker crashes again, report it with the log of the service.";
+    WorkerLost: StatusCode::INTERNAL_SERVER_ERROR, "Workers stopped too often", true,
+        "Workers were killed or stopped responding. Make sure that they keep running, then retry the job.";
+    MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "Movie can't be encoded", false,
+        "A worker has tried three times; the detail has the reason. To try again, create the movie again.";
+    FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "Stored file is damaged", false,
+        "The file is lost or damaged on the disk of the service, so it is not sent. Retry its job to create the \
+         file again.";
+    Unavailable: StatusCode::SERVICE_UNAVAILABLE, "Service is unavailable", true,
+        "The service is shutting down, or has no capacity at the moment.";
+    TimedOut: StatusCode::SERVICE_UNAVAILABLE, "Request timed out", true,
+        "The request took longer than the limit of the service.";
+    InsufficientStorage: StatusCode::INSUFFICIENT_STORAGE, "Disk is full", true,
+        "Delete jobs and uploads that are not needed, or use a larger disk.";
+    QuotaExceeded: StatusCode::FORBIDDEN, "Quota is exceeded", false,
+        "Delete uploads, jobs, or prepared arrays, or ask for a higher limit. The detail has the numbers.";
 }
 
 pub type Result<T, E = ApiError> = std::result::Result<T, E>;
@@ -187,7 +244,7 @@ impl ApiError {
 
     /// The body of the answer.
     pub(super) fn problem(&self) -> Problem {
-        let (status, title, retryable) = self.code.row();
+        let (status, title, retryable, _) = self.code.row();
         let code = self.code.into_str();
         Problem {
             r#type: format!("urn:sci-recon:problem:{code}"),
@@ -224,7 +281,7 @@ impl ApiError {
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
-        let (status, _, retryable) = self.code.row();
+        let (status, _, retryable, _) = self.code.row();
         let retryable = retryable && self.may_succeed_later;
         let mut response = (status, Json(self.problem())).into_response();
         let headers = response.headers_mut();
@@ -255,8 +312,8 @@ impl From<StoreError> for ApiError {
         }
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
-            StoreError::Unready { .. } => Code::CalibrationNotReady,
-            StoreError::Unchecked { .. } => Code::MeasurementNotReady,
+            StoreError::NotReady { what: "calibration", .. } => Code::CalibrationNotReady,
+            StoreError::NotReady { .. } => Code::MeasurementNotReady,
             StoreError::InUse { .. } | StoreError::FileInUse(_) => Code::InUse,
             StoreError::State(_) | StoreError::NotFinal(_) | StoreError::Ended(_) => {
                 Code::IllegalState
@@ -274,10 +331,15 @@ impl From<StoreError> for ApiError {
             }
             StoreError::Damaged { .. } => Code::FileDamaged,
             StoreError::Interrupted | StoreError::Restless(_) => Code::Unavailable,
+            damage if damage.is_damage() => {
+                tracing::error!(%error, "the database is damaged");
+                let detail = "the database of the service is damaged: its administrator must restore a backup";
+                return Self::new(Code::Unavailable, detail);
+            }
             StoreError::DatabaseGone(_) => {
                 tracing::error!(%error, "a change is refused");
-                let detail = "the database of the service was removed or replaced, so nothing is changed: its \
-                              administrator must restore it";
+                let detail = "the database of the service was removed, replaced or truncated, so nothing is changed: \
+                              its administrator must restore it";
                 return Self::new(Code::Unavailable, detail);
             }
             busy if busy.is_busy() => {
@@ -300,11 +362,7 @@ impl From<StoreError> for ApiError {
             return Self::new(code, error.to_string()).retry_after(seconds);
         }
         // A failed calibration or measurement never becomes ready.
-        let may_succeed_later = !matches!(
-            error,
-            StoreError::Unready { error: Some(_), .. }
-                | StoreError::Unchecked { error: Some(_), .. }
-        );
+        let may_succeed_later = !matches!(error, StoreError::NotReady { error: Some(_), .. });
         Self { may_succeed_later, ..Self::new(code, error.to_string()) }
     }
 }

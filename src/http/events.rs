@@ -47,27 +47,14 @@ pub(super) struct Change {
     more: bool,
 }
 
-/// The data of the events of each lab, as JSON.
-#[derive(Debug, Default)]
-struct LabEvents {
-    jobs: HashMap<Lab, String>,
-    calibrations: HashMap<Lab, String>,
-    measurements: HashMap<Lab, String>,
-    /// Listeners do not get these; requests wait for the check of a model with them.
-    models: HashMap<Lab, String>,
-}
+/// The data of the events of each lab, as JSON, for each of [`KINDS`].
+type LabEvents = [HashMap<Lab, String>; 4];
 
-/// Selects the events of one kind of resource.
-type Kind = fn(&LabEvents) -> &HashMap<Lab, String>;
-
-fn kind(what: Made) -> Kind {
-    match what {
-        Made::Job => |events| &events.jobs,
-        Made::Calibration => |events| &events.calibrations,
-        Made::Measurement => |events| &events.measurements,
-        Made::Model | Made::Upload => |events| &events.models,
-    }
-}
+/// The kinds of resources that events are about. Listeners do not get those of models; requests wait for the check of a
+/// model with them.
+const KINDS: [Made; 4] = [Made::Job, Made::Calibration, Made::Measurement, Made::Model];
+/// The names of the events that listeners get, in the order of [`KINDS`].
+const NAMES: [&str; 3] = ["jobs", "calibrations", "measurements"];
 
 /// The events of all labs, with the number of the last change in them.
 type Message = (i64, Arc<LabEvents>);
@@ -79,7 +66,7 @@ pub(super) struct Events {
     /// Number of the last change for which events were sent.
     last: Arc<AtomicI64>,
     store: Store,
-    places: Places,
+    places: Places<Lab>,
     waiters: Waiters,
     closing: CancellationToken,
 }
@@ -91,7 +78,7 @@ impl Events {
         let last = Arc::default();
         let watching = watch(store.clone(), sender.clone(), Arc::clone(&last));
         tokio::spawn(closing.clone().run_until_cancelled_owned(watching));
-        let (places, waiters) = (Places::new(LISTENERS), Waiters::default());
+        let (places, waiters) = (Places::for_labs(LISTENERS), Waiters::default());
         Self { sender, last, store, places, waiters, closing }
     }
 
@@ -104,7 +91,7 @@ impl Events {
         time: Duration,
     ) -> Result<()> {
         let ended = || async { Ok(store.job_state(lab, job).await?.is_final()) };
-        self.until(lab, time, (kind(Made::Job), job.to_string()), ended).await
+        self.until(lab, time, (Made::Job, job.to_string()), ended).await
     }
 
     /// Waits until a calibration, measurement or model is ready or rejected.
@@ -116,7 +103,7 @@ impl Events {
         time: Duration,
     ) -> Result<()> {
         let settled = || async { Ok(store.is_settled(lab, id).await?) };
-        self.until(lab, time, (kind(what), id.to_string()), settled).await
+        self.until(lab, time, (what, id.to_string()), settled).await
     }
 
     /// Waits until the uploads for a calibration, measurement or model are checked.
@@ -128,7 +115,7 @@ impl Events {
         time: Duration,
     ) -> Result<()> {
         let checked = || async { Ok(store.is_checked(id).await?) };
-        self.until(lab, time, (kind(what), id.to_string()), checked).await
+        self.until(lab, time, (what, id.to_string()), checked).await
     }
 
     /// Waits until `settled` is true of the resource with this name. Returns after `time` or when the service stops, too.
@@ -137,7 +124,7 @@ impl Events {
         &self,
         lab: &Lab,
         time: Duration,
-        (kind, name): (Kind, String),
+        (what, name): (Made, String),
         settled: impl Fn() -> F,
     ) -> Result<()> {
         let _place = self.waiters.take(lab, time)?;
@@ -148,7 +135,9 @@ impl Events {
                 loop {
                     match receiver.recv().await {
                         Ok((_, changes)) => {
-                            let text = kind(&changes).get(lab);
+                            let mut kinds = KINDS.iter().zip(&*changes);
+                            let labs = kinds.find(|(kind, _)| **kind == what);
+                            let text = labs.and_then(|(_, labs)| labs.get(lab));
                             if text.is_some_and(|text| text.contains(&name) || text.contains(MORE))
                             {
                                 break;
@@ -267,12 +256,8 @@ async fn lab_events(store: &Store, changes: Changes) -> Result<LabEvents, StoreE
         return Ok(to_json(by_kind));
     };
     for item in items {
-        let kind = match item.what.as_str() {
-            "job" => 0,
-            "calibration" => 1,
-            "measurement" => 2,
-            _ => 3,
-        };
+        let is_of = |kind: &Made| kind.into_str() == item.what;
+        let Some(kind) = KINDS.iter().position(is_of) else { continue };
         let change = by_kind[kind].entry(item.lab).or_default();
         if item.exists { &mut change.changed } else { &mut change.deleted }.push(item.id);
     }
@@ -281,13 +266,12 @@ async fn lab_events(store: &Store, changes: Changes) -> Result<LabEvents, StoreE
 
 /// Serializes the changes of each kind.
 fn to_json(by_kind: [HashMap<Lab, Change>; 4]) -> LabEvents {
-    let [jobs, calibrations, measurements, models] = by_kind.map(|labs| {
+    by_kind.map(|labs| {
         let text = |(lab, change): (Lab, Change)| {
             Some((lab, serde_json::to_string(&change.limited()).ok()?))
         };
         labs.into_iter().filter_map(text).collect()
-    });
-    LabEvents { jobs, calibrations, measurements, models }
+    })
 }
 
 impl Change {
@@ -338,7 +322,7 @@ struct Listener {
     closing: CancellationToken,
     /// Events to send next.
     waiting: VecDeque<Event>,
-    _place: Place,
+    _place: Place<Lab>,
 }
 
 impl Listener {
@@ -384,13 +368,9 @@ impl Listener {
     /// of them again.
     fn queue(&mut self, number: i64, lab_events: &LabEvents) {
         self.last_sent = number;
-        let kinds = [
-            ("jobs", &lab_events.jobs),
-            ("calibrations", &lab_events.calibrations),
-            ("measurements", &lab_events.measurements),
-        ];
-        let mut events: Vec<Event> = kinds
+        let mut events: Vec<Event> = NAMES
             .into_iter()
+            .zip(lab_events)
             .filter_map(|(name, labs)| {
                 Some(Event::default().event(name).data(labs.get(&self.lab)?))
             })

@@ -15,7 +15,6 @@ use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
-use super::problems;
 use super::truth;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
@@ -142,13 +141,14 @@ impl JobProblem {
             FailureCause::Crash => Code::WorkerCrashed,
             FailureCause::Loss => Code::WorkerLost,
         });
+        let (.., remedy) = code.row();
         Self {
             problem: ApiError::new(code, error).problem_of_job(),
             stage: task.as_ref().map(|task| task.kind.into_str()),
             snapshot: task.as_ref().and_then(|task| task.kind.snapshot()),
             tile: task.as_ref().and_then(|task| task.kind.tile()),
             attempts: task.map(|task| task.attempts),
-            remedy: problems::meaning(code),
+            remedy,
         }
     }
 }
@@ -326,7 +326,7 @@ async fn next_end(app: &App) -> Result<u64> {
 }
 
 /// Resolves a request: checks it against its measurement, and fills in the defaults.
-async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobSpec> {
+async fn resolve(app: &App, access: &Access, mut request: JobRequest) -> Result<JobSpec> {
     let lab = &access.lab;
     let invalid_priority = role_error(access, request.priority);
     let measurement = app.store.measurement(lab, request.measurement).await;
@@ -348,6 +348,12 @@ async fn resolve(app: &App, access: &Access, request: JobRequest) -> Result<JobS
             Some(model.map_err(|error| ApiError::reference("/model", error))?.into())
         }
     };
+    if request.algorithm != Algorithm::Learned && app.has_gpu().await? {
+        // All tiles use one network, on any worker.
+        let schedule = request.schedule.take();
+        let schedule = schedule.unwrap_or_else(|| request.algorithm.default_schedule());
+        request.schedule = Some(schedule.with_float_networks());
+    }
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
     let resolved = resolved.and_then(|spec| spec.with_dispersion(calibration.facts.dispersion));

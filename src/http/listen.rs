@@ -19,7 +19,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tower::ServiceExt;
 
 use super::client::Client;
-use super::client_places::Places;
+use super::shares::Places;
 use super::throttle::Throttle;
 use super::write_deadline::{LeastRate, WriteDeadline};
 use crate::config::ServeArguments;
@@ -42,7 +42,7 @@ pub async fn listen(
 ) {
     let (rate, time) = (settings.download_bytes_per_second, settings.download_stall());
     let least = LeastRate { bytes: rate.saturating_mul(time.as_secs()), time };
-    let places = Places::new(connection_limit());
+    let places = Places::for_clients(connection_limit());
     let proxies: Arc<[IpNet]> = settings.trusted_proxies.as_slice().into();
     let refusals = Throttle::default();
     let service = ServiceExt::<Request<Incoming>>::map_result(router, cut);
@@ -67,8 +67,8 @@ pub async fn listen(
         let peer = address.ip();
         let is_proxy = proxies.iter().any(|net| net.contains(&peer.to_canonical()));
         // The connections of a proxy serve many clients, so requests are counted instead.
-        let place = if is_proxy { places.take_any(peer) } else { places.take(peer) };
-        let Some(place) = place else {
+        let share = if is_proxy { places.most } else { places.share };
+        let Ok(place) = places.take_within(&Client::network(peer), share) else {
             refusals.pass(
                 || tracing::warn!(%address, "too many connections"),
                 |left_out| tracing::warn!(left_out, "too many connections"),

@@ -1,20 +1,14 @@
 //! `/v1/measurements`: coded snapshots.
 
-use axum::http::{StatusCode, header};
-use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-use super::app::App;
-use super::context::{RequestContext, changed};
-use super::error::{ApiError, Problem, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{ListQuery, NoQuery, PageBody, Renaming};
-use super::submissions::{PATIENCE, Stage, make, pending};
+use super::error::{Problem, Result};
+use super::submissions::{Shown, Stage, pending};
 use engine::job::{
-    CalibrationId, Finding, Lab, Label, MeasurementId, MeasurementRequest, Reading, Sequence,
-    Sha256, Submission, Timestamp,
+    CalibrationId, Finding, Label, MeasurementId, MeasurementRequest, Reading, Sequence, Sha256,
+    Submission, Timestamp,
 };
-use store::{Asked, Made, Measurement, Page, Request, StoreError};
+use store::{Asked, StoreError};
 
 /// A measurement. Facts about its data are null until they are checked.
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -30,6 +24,12 @@ pub(super) struct MeasurementBody {
     name: Option<Label>,
     calibration: CalibrationId,
     data: Sha256,
+    #[serde(flatten)]
+    facts: MeasurementFacts,
+}
+
+#[derive(Debug, Default, Serialize, schemars::JsonSchema)]
+struct MeasurementFacts {
     /// Format of the file.
     format: Option<String>,
     /// Type of the samples in the file.
@@ -52,45 +52,51 @@ pub(super) struct MeasurementBody {
     reading: Option<Reading>,
 }
 
-impl From<Measurement> for MeasurementBody {
-    fn from(Measurement { id, created_at, facts, .. }: Measurement) -> Self {
-        Self {
-            id,
-            state: Stage::Ready,
-            error: None,
-            problem: None,
-            created_at,
-            name: facts.name,
-            calibration: facts.calibration,
-            data: facts.data,
-            format: Some(facts.format),
-            sample: Some(facts.sample),
-            axes: facts.axes,
-            snapshots: Some(facts.snapshots),
-            height: Some(facts.height),
-            width: Some(facts.width),
-            full_scale: Some(facts.full_scale),
-            camera_fps: facts.camera_fps,
-            exposure_s: facts.exposure_s,
-            sequence: Some(facts.sequence),
-            dark: facts.dark,
-            warnings: facts.warnings,
-            reading: Some(facts.reading),
-        }
-    }
-}
+impl Shown for MeasurementId {
+    const PATH: &'static str = "/v1/measurements";
+    const SUBMISSION: fn(MeasurementRequest) -> Submission = Submission::Measurement;
+    type Request = MeasurementRequest;
+    type Body = MeasurementBody;
 
-impl TryFrom<Request> for MeasurementBody {
-    type Error = ApiError;
-
-    fn try_from(request: Request) -> Result<Self> {
+    fn body(asked: Asked<Self>) -> Result<MeasurementBody> {
+        let request = match asked {
+            Asked::Pending(request) => *request,
+            Asked::Ready(measurement) => {
+                let facts = measurement.facts;
+                return Ok(MeasurementBody {
+                    id: measurement.id,
+                    state: Stage::Ready,
+                    error: None,
+                    problem: None,
+                    created_at: measurement.created_at,
+                    name: measurement.name,
+                    calibration: facts.calibration,
+                    data: facts.data,
+                    facts: MeasurementFacts {
+                        format: Some(facts.format),
+                        sample: Some(facts.sample),
+                        axes: facts.axes,
+                        snapshots: Some(facts.snapshots),
+                        height: Some(facts.height),
+                        width: Some(facts.width),
+                        full_scale: Some(facts.full_scale),
+                        camera_fps: facts.camera_fps,
+                        exposure_s: facts.exposure_s,
+                        sequence: Some(facts.sequence),
+                        dark: facts.dark,
+                        warnings: facts.warnings,
+                        reading: Some(facts.reading),
+                    },
+                });
+            }
+        };
         let (state, error, problem) = pending(&request);
         let Submission::Measurement(submission) = request.submission else {
             return Err(
                 StoreError::NotFound { what: "measurement", id: request.id.to_string() }.into()
             );
         };
-        Ok(Self {
+        Ok(MeasurementBody {
             id: request.id.into(),
             state,
             error,
@@ -99,98 +105,12 @@ impl TryFrom<Request> for MeasurementBody {
             name: request.name,
             calibration: submission.calibration,
             data: submission.data,
-            format: None,
-            sample: None,
-            axes: None,
-            snapshots: None,
-            height: None,
-            width: None,
-            full_scale: None,
-            camera_fps: submission.camera_fps,
-            exposure_s: submission.exposure_s,
-            sequence: None,
-            dark: submission.dark,
-            warnings: Vec::new(),
-            reading: None,
+            facts: MeasurementFacts {
+                camera_fps: submission.camera_fps,
+                exposure_s: submission.exposure_s,
+                dark: submission.dark,
+                ..MeasurementFacts::default()
+            },
         })
     }
-}
-
-impl TryFrom<Asked<Measurement>> for MeasurementBody {
-    type Error = ApiError;
-
-    fn try_from(asked: Asked<Measurement>) -> Result<Self> {
-        match asked {
-            Asked::Ready(measurement) => Ok(measurement.into()),
-            Asked::Pending(request) => (*request).try_into(),
-        }
-    }
-}
-
-pub(super) async fn create(
-    Caller(app, access): Caller,
-    context: RequestContext,
-    Body(request): Body<MeasurementRequest>,
-) -> Result<Response> {
-    let (key, wait) = (request_key(&context.headers, &request)?, context.wait());
-    let submission = Submission::Measurement(request);
-    let inserted = make(&app, &access, submission, key.as_ref(), wait.time(PATIENCE)).await?;
-    let (status, id) = created(inserted);
-    let body = body(&app, &access.lab, id).await?;
-    let status = if body.state == Stage::Ready { status } else { StatusCode::ACCEPTED };
-    let location = [(header::LOCATION, format!("/v1/measurements/{id}"))];
-    Ok(wait.applied((location, changed(status, &body)?).into_response()))
-}
-
-async fn body(app: &App, lab: &Lab, id: MeasurementId) -> Result<MeasurementBody> {
-    app.store.asked_measurement(lab, id).await?.try_into()
-}
-
-pub(super) async fn list(
-    Caller(app, access): Caller,
-    QueryOf(query): QueryOf<ListQuery<MeasurementId>>,
-    request: RequestContext,
-) -> Result<Response> {
-    let (limit, filter) = (query.limit.get(), query.filter());
-    let Page { items, more } = app.store.measurements(&access.lab, filter, limit).await?;
-    let items = items.into_iter().map(TryInto::try_into);
-    let items: Vec<MeasurementBody> = items.collect::<Result<_>>()?;
-    PageBody::new(Page { items, more }, |item| item.id.to_string(), |item| item).answer(&request)
-}
-
-pub(super) async fn show(
-    Caller(app, access): Caller,
-    Params(id): Params<MeasurementId>,
-    QueryOf(NoQuery {}): QueryOf<NoQuery>,
-    request: RequestContext,
-) -> Result<Response> {
-    let wait = request.wait();
-    if let Some(time) = app.wait(wait) {
-        let resource = (Made::Measurement, id.into());
-        app.events.settled(&app.store, &access.lab, resource, time).await?;
-    }
-    Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
-}
-
-pub(super) async fn rename(
-    Caller(app, access): Caller,
-    Params(id): Params<MeasurementId>,
-    request: RequestContext,
-    Body(renaming): Body<Renaming>,
-) -> Result<Response> {
-    let _guard =
-        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
-    app.store.rename_measurement(&access.lab, id, renaming.name.as_ref()).await?;
-    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
-}
-
-pub(super) async fn delete(
-    Caller(app, access): Caller,
-    Params(id): Params<MeasurementId>,
-    request: RequestContext,
-) -> Result<StatusCode> {
-    let _guard =
-        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
-    app.store.delete_measurement(&access.lab, id).await?;
-    Ok(StatusCode::NO_CONTENT)
 }

@@ -31,6 +31,7 @@ mod me;
 mod measurements;
 mod metrics;
 mod models;
+mod negotiation;
 mod page;
 mod pictures;
 mod problems;

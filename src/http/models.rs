@@ -2,21 +2,52 @@
 
 use std::time::Duration;
 
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
+use serde::Serialize;
 
-use super::app::App;
 use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{ListQuery, PageBody, Renaming};
-use super::submissions::make;
-use engine::job::{Lab, ModelId, ModelRequest, Submission};
-use store::{Model, StoreError};
+use super::extract::{Body, Caller, Params, created, request_key};
+use super::submissions::{Shown, body, make};
+use engine::job::{Label, ModelId, ModelRequest, Submission, Timestamp};
+use store::{Asked, NewModel, StoreError};
 
 /// Time for which a request waits for the check of a network, including checks that run before it. A client can't poll a
 /// pending model, because it has no state.
 const PATIENCE: Duration = Duration::from_secs(900);
+
+#[derive(Debug, Serialize, schemars::JsonSchema)]
+#[schemars(rename = "Model")]
+pub(super) struct ModelBody {
+    id: ModelId,
+    created_at: Timestamp,
+    name: Option<Label>,
+    #[serde(flatten)]
+    facts: NewModel,
+}
+
+impl Shown for ModelId {
+    const PATH: &'static str = "/v1/models";
+    const SUBMISSION: fn(ModelRequest) -> Submission = Submission::Model;
+    type Request = ModelRequest;
+    type Body = ModelBody;
+
+    /// Errors: 404 if the network has not passed its check.
+    fn body(asked: Asked<Self>) -> Result<ModelBody> {
+        match asked {
+            Asked::Ready(model) => Ok(ModelBody {
+                id: model.id,
+                created_at: model.created_at,
+                name: model.name,
+                facts: model.facts,
+            }),
+            Asked::Pending(request) => {
+                Err(StoreError::NotFound { what: "model", id: request.id.to_string() }.into())
+            }
+        }
+    }
+}
 
 pub(super) async fn create(
     Caller(app, access): Caller,
@@ -27,25 +58,12 @@ pub(super) async fn create(
     let inserted = make(&app, &access, Submission::Model(request), key.as_ref(), PATIENCE).await?;
     let (status, id) = created::<ModelId>(inserted);
     let location = [(header::LOCATION, format!("/v1/models/{id}"))];
-    let model = app.store.model(&access.lab, id).await.map_err(|error| match error {
-        StoreError::NotFound { .. } => {
-            let detail =
-                "the check of the network takes long: send the request again, with an Idempotency-Key, to wait for it";
-            ApiError::new(Code::TimedOut, detail)
-        }
-        error => error.into(),
-    })?;
-    Ok((location, changed(status, &model)?).into_response())
-}
-
-pub(super) async fn list(
-    Caller(app, access): Caller,
-    QueryOf(query): QueryOf<ListQuery<ModelId>>,
-    request: RequestContext,
-) -> Result<Response> {
-    let limit = query.limit.get();
-    let page = app.store.models(&access.lab, query.filter(), limit).await?;
-    PageBody::new(page, |item| item.id.to_string(), |item| item).answer(&request)
+    let asked = app.store.asked(&access.lab, id).await?;
+    if let Asked::Pending(_) = asked {
+        let detail = "the check of the network takes long: send the request again, with an Idempotency-Key, to wait for it";
+        return Err(ApiError::new(Code::TimedOut, detail));
+    }
+    Ok((location, changed(status, &ModelId::body(asked)?)?).into_response())
 }
 
 pub(super) async fn show(
@@ -54,31 +72,4 @@ pub(super) async fn show(
     request: RequestContext,
 ) -> Result<Response> {
     request.json(&body(&app, &access.lab, id).await?)
-}
-
-async fn body(app: &App, lab: &Lab, id: ModelId) -> Result<Model> {
-    Ok(app.store.model(lab, id).await?)
-}
-
-pub(super) async fn rename(
-    Caller(app, access): Caller,
-    Params(id): Params<ModelId>,
-    request: RequestContext,
-    Body(renaming): Body<Renaming>,
-) -> Result<Response> {
-    let _guard =
-        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
-    app.store.rename_model(&access.lab, id, renaming.name.as_ref()).await?;
-    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
-}
-
-pub(super) async fn delete(
-    Caller(app, access): Caller,
-    Params(id): Params<ModelId>,
-    request: RequestContext,
-) -> Result<StatusCode> {
-    let _guard =
-        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
-    app.store.delete_model(&access.lab, id).await?;
-    Ok(StatusCode::NO_CONTENT)
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use axum::http::HeaderMap;
 use axum::response::Response;
-use ndarray::{Array2, Axis};
+use ndarray::Axis;
 use serde::{Deserialize, Serialize};
 
 use super::conditional;
@@ -13,11 +13,11 @@ use super::extract::{Caller, Params, QueryOf};
 use super::intake;
 use super::jobs::with_snapshot;
 use super::results::{result_file, white_level};
-use super::truth::open;
+use super::truth::{frames_before, next_frame, open};
 use engine::intake::Opened;
 use engine::job::{JobId, SceneShape, Sha256};
 use engine::pipeline::quality::{FrameQuality, Quality};
-use formats::{Axes, Channels, FormatError, Limits, npy};
+use formats::{Axes, Channels, Limits, npy};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -53,14 +53,18 @@ pub(super) async fn show(
     })?;
     app.store.upload(&access.lab, truth).await?;
     result_file(&app, &job, Some(snapshot), "frames.npy").await?;
-    let (_, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
-    let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
-    let (shape, limits) = (job.spec.frame_shape(), app.limits);
-    let frames = intake::run(&app, &access.lab, move || {
-        let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
-        compare((&path, channels), truth, snapshot as usize, shape)
-    });
-    let quality: Quality = frames.await?.into();
+    let (file, path, _) = app.store.open_result(&job, Some(snapshot), "frames.npy").await?;
+    let measure = async {
+        let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
+        let (shape, limits) = (job.spec.frame_shape(), app.limits);
+        let frames = intake::run(&app, &access.lab, move || {
+            let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
+            compare((&path, channels), truth, snapshot as usize, shape)
+        });
+        Ok::<_, ApiError>(frames.await?.into())
+    };
+    let key = format!("{} {snapshot} {truth} {full_scale:?} {axes:?}", file.sha256);
+    let quality = app.qualities.get_or_insert_async(&key, measure).await?;
     let peak = white_level(&app, id).await?.unwrap_or(1.0);
     conditional::json(&QualityBody { truth, peak, quality: quality.relative_to(peak) }, &headers)
 }
@@ -73,15 +77,14 @@ fn compare(
     snapshot: usize,
     shape: SceneShape,
 ) -> Result<Vec<FrameQuality>> {
-    let SceneShape { frames, height, snapshots, mosaic, .. } = shape;
-    let has_all = truth.info.frames == frames * snapshots as usize;
-    let skipped = if has_all { snapshot * frames } else { 0 };
-    for _ in 0..skipped {
-        next(&mut truth)?;
+    let SceneShape { frames, height, mosaic, .. } = shape;
+    let skipped = frames_before(&truth, snapshot, shape);
+    for frame in 0..skipped {
+        next_frame(&mut truth, frame)?;
     }
     let result = npy::open_windows(path, &Limits::default())?;
     let frame_quality = |k: usize| -> Result<FrameQuality> {
-        let truth = next(&mut truth)?;
+        let truth = next_frame(&mut truth, skipped + k)?;
         let frame = result.read_window(k..k + 1, 0..height, 0..result.info().width)?;
         let mut frame = frame.index_axis_move(Axis(0), 0);
         if let (Channels::Grey, Some(mosaic)) = (channels, mosaic) {
@@ -91,9 +94,4 @@ fn compare(
         quality.map_err(|error| ApiError::internal(&error))
     };
     (0..frames).map(frame_quality).collect()
-}
-
-fn next(truth: &mut Opened) -> Result<Array2<f32>> {
-    let missing = || FormatError::Internal("a stack has fewer frames than it says".into());
-    Ok(truth.next_frame()?.ok_or_else(missing)?)
 }

@@ -29,7 +29,7 @@ pub(super) async fn html(
     headers: HeaderMap,
 ) -> Result<Response> {
     let report = report(&app, &access.lab, id).await?;
-    let name = app.store.calibration(&access.lab, id).await?.facts.name;
+    let name = app.store.calibration(&access.lab, id).await?.name;
     let title = name.map_or_else(|| id.to_string(), |name| name.as_str().to_owned());
     let text = report_page(&title, &report).into_bytes();
     let mut response = conditional::content(&headers, "text/html; charset=utf-8", text);

@@ -19,14 +19,16 @@ use tower_http::trace::TraceLayer;
 
 use super::access::{self, Rule};
 use super::app::App;
-use super::client_places::{self, Places};
+use super::client_places;
 use super::listen::connection_limit;
 use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
+use super::shares::Places;
 use super::{
     algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
-    layers, me, measurements, models, pictures, problems, quality, reference, reports, results,
-    samples, session, system, tiles, tus,
+    layers, me, models, pictures, problems, quality, reference, reports, results, samples, session,
+    submissions, system, tiles, tus,
 };
+use engine::job::{CalibrationId, MeasurementId, ModelId};
 
 /// Time for which a browser remembers what another origin may do.
 const PREFLIGHT_AGE: Duration = Duration::from_secs(3600);
@@ -49,13 +51,13 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/blobs/{sha256}/content").get(blobs::content).slow(),
         R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
-        R::at("/v1/calibrations").get(calibrations::list).post(calibrations::create).slow(),
-        R::at("/v1/calibrations/{calibration}").get(calibrations::show).patch(calibrations::rename).delete(calibrations::delete),
+        R::at("/v1/calibrations").get(calibrations::list).post(submissions::create::<CalibrationId>).slow(),
+        R::at("/v1/calibrations/{calibration}").get(submissions::show::<CalibrationId>).patch(submissions::rename::<CalibrationId>).delete(submissions::delete::<CalibrationId>),
         R::at("/v1/calibrations/{calibration}/report").get(reports::json),
-        R::at("/v1/measurements").get(measurements::list).post(measurements::create).slow(),
-        R::at("/v1/measurements/{measurement}").get(measurements::show).patch(measurements::rename).delete(measurements::delete),
-        R::at("/v1/models").get(models::list).post(models::create).slow(),
-        R::at("/v1/models/{model}").get(models::show).patch(models::rename).delete(models::delete),
+        R::at("/v1/measurements").get(submissions::list::<MeasurementId>).post(submissions::create::<MeasurementId>).slow(),
+        R::at("/v1/measurements/{measurement}").get(submissions::show::<MeasurementId>).patch(submissions::rename::<MeasurementId>).delete(submissions::delete::<MeasurementId>),
+        R::at("/v1/models").get(submissions::list::<ModelId>).post(models::create).slow(),
+        R::at("/v1/models/{model}").get(models::show).patch(submissions::rename::<ModelId>).delete(submissions::delete::<ModelId>),
         R::at("/v1/algorithms").get(algorithms::list),
         R::at("/v1/jobs").get(jobs::list).post(jobs::create).only(Rule::AcrossLabs),
         R::at("/v1/samples").post(samples::create),
@@ -149,7 +151,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(layers::method_not_allowed)
         .layer(DefaultBodyLimit::max(JSON_BYTES))
         .layer(CatchPanicLayer::custom(layers::panicked))
-        .layer(from_fn_with_state(Places::new(connection_limit()), client_places::limit))
+        .layer(from_fn_with_state(Places::for_clients(connection_limit()), client_places::limit))
         .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::relative_references))
         .layer(ServiceBuilder::new().layer(sniffing).layer(referrer).layer(framing))

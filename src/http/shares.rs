@@ -1,6 +1,7 @@
-//! Limits on concurrent work that labs share, so that no lab can use all of it.
+//! Limits on concurrent work, so that no lab and no client can use all of it.
 
 use std::collections::HashMap;
+use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Instant;
 
@@ -10,22 +11,30 @@ use super::error::{ApiError, Code, Result};
 use super::turnover::Turnover;
 use engine::job::Lab;
 
-/// Places for requests that take long. A lab gets at most half of them. A lab without a place always gets one, even if
-/// all are taken.
+/// Places for work that takes long, or for connections. Each is taken by a holder: a lab, or the network of a client.
 #[derive(Debug, Clone)]
-pub(super) struct Places {
-    most: usize,
-    of_a_lab: usize,
-    taken: Arc<Mutex<Taken>>,
+pub(super) struct Places<Holder: Eq + Hash> {
+    pub(super) most: usize,
+    /// Most places of one holder.
+    pub(super) share: usize,
+    /// True if a holder without a place gets one although all are taken.
+    pub(super) always_one: bool,
+    pub(super) taken: Arc<Mutex<Taken<Holder>>>,
 }
 
-#[derive(Debug, Default)]
-struct Taken {
-    by_lab: HashMap<Lab, usize>,
+#[derive(Debug)]
+pub(super) struct Taken<Holder> {
+    pub(super) by_holder: HashMap<Holder, usize>,
     turnover: Turnover,
 }
 
-/// No place is free for the lab.
+impl<Holder> Default for Taken<Holder> {
+    fn default() -> Self {
+        Self { by_holder: HashMap::new(), turnover: Turnover::default() }
+    }
+}
+
+/// No place is free for the holder.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Full {
     /// Estimated time until one is free.
@@ -34,41 +43,51 @@ pub(super) struct Full {
 
 /// A place. It is free again when this is dropped.
 #[derive(Debug)]
-pub(super) struct Place {
-    places: Places,
-    lab: Lab,
+pub(super) struct Place<Holder: Eq + Hash> {
+    places: Places<Holder>,
+    holder: Holder,
     since: Instant,
 }
 
-impl Places {
-    pub(super) fn new(most: usize) -> Self {
-        Self { most, of_a_lab: most.div_ceil(2).max(1), taken: Arc::default() }
-    }
-
-    /// Takes a place for this lab.
-    ///
-    /// Errors: [`Full`] if the lab has its share, or if all places are taken.
-    pub(super) fn take(&self, lab: &Lab) -> Result<Place, Full> {
-        let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
-        let all = taken.by_lab.values().sum::<usize>();
-        let own = taken.by_lab.get(lab).copied().unwrap_or_default();
-        if own > 0 && (own >= self.of_a_lab || all >= self.most) {
-            let held = if own >= self.of_a_lab { own } else { all };
-            return Err(Full { seconds: taken.turnover.next_end(held) });
-        }
-        *taken.by_lab.entry(lab.clone()).or_default() += 1;
-        Ok(Place { places: self.clone(), lab: lab.clone(), since: Instant::now() })
+impl Places<Lab> {
+    /// Places for requests that take long. A lab gets at most half of them.
+    pub(super) fn for_labs(most: usize) -> Self {
+        let share = most.div_ceil(2).max(1);
+        Self { most, share, always_one: true, taken: Arc::default() }
     }
 }
 
-impl Drop for Place {
+impl<Holder: Eq + Hash + Clone> Places<Holder> {
+    /// Takes a place for this holder.
+    ///
+    /// Errors: [`Full`] if the holder has its share, or if all places are taken.
+    pub(super) fn take(&self, holder: &Holder) -> Result<Place<Holder>, Full> {
+        self.take_within(holder, self.share)
+    }
+
+    /// Takes a place for a holder whose share is `share`.
+    pub(super) fn take_within(&self, holder: &Holder, share: usize) -> Result<Place<Holder>, Full> {
+        let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
+        let all = taken.by_holder.values().sum::<usize>();
+        let own = taken.by_holder.get(holder).copied().unwrap_or_default();
+        let gets_its_first = own == 0 && self.always_one;
+        if !gets_its_first && (own >= share || all >= self.most) {
+            let held = if own >= share { own } else { all };
+            return Err(Full { seconds: taken.turnover.next_end(held) });
+        }
+        *taken.by_holder.entry(holder.clone()).or_default() += 1;
+        Ok(Place { places: self.clone(), holder: holder.clone(), since: Instant::now() })
+    }
+}
+
+impl<Holder: Eq + Hash> Drop for Place<Holder> {
     fn drop(&mut self) {
         let mut taken = self.places.taken.lock().unwrap_or_else(PoisonError::into_inner);
         taken.turnover.record(self.since.elapsed());
-        if let Some(own) = taken.by_lab.get_mut(&self.lab) {
+        if let Some(own) = taken.by_holder.get_mut(&self.holder) {
             *own -= 1;
             if *own == 0 {
-                taken.by_lab.remove(&self.lab);
+                taken.by_holder.remove(&self.holder);
             }
         }
     }
@@ -80,7 +99,7 @@ impl Drop for Place {
 pub(super) struct Turns {
     all: Arc<Semaphore>,
     of_labs: PerLab<Semaphore>,
-    waiting: Places,
+    waiting: Places<Lab>,
 }
 
 /// Permission to work. The turn ends when this is dropped.
@@ -89,13 +108,13 @@ pub(super) struct Turn {
     // Fields are dropped in this order: the next item of the lab enters the queue once this one has left it.
     _all: OwnedSemaphorePermit,
     _of_lab: OwnedSemaphorePermit,
-    _waiting: Place,
+    _waiting: Place<Lab>,
 }
 
 impl Turns {
     /// `at_once` items run at the same time, and `waiting` items of a lab may wait or run.
     pub(super) fn new(at_once: usize, waiting: usize) -> Self {
-        let waiting = Places { most: usize::MAX, of_a_lab: waiting, taken: Arc::default() };
+        let waiting = Places { share: waiting, ..Places::for_labs(usize::MAX) };
         Self { all: Arc::new(Semaphore::new(at_once)), of_labs: PerLab::default(), waiting }
     }
 
@@ -162,7 +181,7 @@ mod tests {
 
     #[test]
     fn a_lab_leaves_places_for_others() {
-        let places = Places::new(4);
+        let places = Places::for_labs(4);
         let (a, b, c) = (lab("a"), lab("b"), lab("c"));
         let of_a: Vec<_> = (0..3).map(|_| places.take(&a)).collect();
         assert!(of_a[1].is_ok() && of_a[2].is_err(), "a lab gets half of the places");
@@ -172,7 +191,7 @@ mod tests {
         assert!(of_c[0].is_ok() && of_c[1].is_err(), "a lab gets one place although all are taken");
         drop(of_a);
         assert!(places.take(&c).is_ok());
-        assert!(Places::new(1).take(&a).is_ok());
+        assert!(Places::for_labs(1).take(&a).is_ok());
     }
 
     #[tokio::test]

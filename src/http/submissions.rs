@@ -1,19 +1,27 @@
 //! Requests for calibrations, measurements and models, which are made from uploads. A task of the queue checks the uploads;
-//! the answer waits for it for a limited time.
+//! the answer waits for it for a limited time. The handlers below serve all three kinds.
 
 use std::str::FromStr;
 use std::time::Duration;
 
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use serde::de::DeserializeOwned;
 
 use super::access::Access;
 use super::app::App;
+use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Problem, REQUEST_ID, Result};
+use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
+use super::page::{Limit, ListQuery, NoQuery, PageBody, Renaming};
 use engine::job::{CheckLimits, InvalidId, JobState, Lab, Submission, ThingId};
-use store::{Inserted, Made, NewRequest, Request, RequestKey, StoreError};
+use store::{
+    Asked, Filter, Inserted, Made, NewRequest, Page, Request, RequestKey, Resource, StoreError,
+};
 
 /// Default time for which a request waits for a check.
-pub(super) const PATIENCE: Duration = Duration::from_secs(10);
+const PATIENCE: Duration = Duration::from_secs(10);
 
 /// State of a calibration or measurement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -26,6 +34,98 @@ pub(super) enum Stage {
     Ready,
     /// The check failed; `problem` says why.
     Failed,
+}
+
+/// A kind of resource that is made from uploads: its identifiers, and its requests and answers.
+pub(super) trait Shown: Resource + DeserializeOwned + 'static {
+    /// The address of the list.
+    const PATH: &'static str;
+    const SUBMISSION: fn(Self::Request) -> Submission;
+    type Request: Serialize + DeserializeOwned + Send;
+    type Body: Serialize + Send;
+
+    fn body(asked: Asked<Self>) -> Result<Self::Body>;
+}
+
+pub(super) async fn create<Id: Shown>(
+    Caller(app, access): Caller,
+    context: RequestContext,
+    Body(request): Body<Id::Request>,
+) -> Result<Response> {
+    let (key, wait) = (request_key(&context.headers, &request)?, context.wait());
+    let submission = Id::SUBMISSION(request);
+    let inserted = make(&app, &access, submission, key.as_ref(), wait.time(PATIENCE)).await?;
+    let (status, id) = created::<Id>(inserted);
+    let asked = app.store.asked(&access.lab, id).await?;
+    let is_ready = matches!(asked, Asked::Ready(_));
+    let status = if is_ready { status } else { StatusCode::ACCEPTED };
+    let location = [(header::LOCATION, format!("{}/{id}", Id::PATH))];
+    Ok(wait.applied((location, changed(status, &Id::body(asked)?)?).into_response()))
+}
+
+pub(super) async fn body<Id: Shown>(app: &App, lab: &Lab, id: Id) -> Result<Id::Body> {
+    Id::body(app.store.asked(lab, id).await?)
+}
+
+pub(super) async fn list<Id: Shown>(
+    caller: Caller,
+    QueryOf(query): QueryOf<ListQuery<Id>>,
+    request: RequestContext,
+) -> Result<Response> {
+    page(caller, (query.limit, query.filter()), &request).await
+}
+
+/// A page of a list.
+pub(super) async fn page<Id: Shown>(
+    Caller(app, access): Caller,
+    (limit, filter): (Limit, Filter<Id>),
+    request: &RequestContext,
+) -> Result<Response> {
+    let Page { items, more } = app.store.things(&access.lab, filter, limit.get()).await?;
+    let id = |asked: &Asked<Id>| match asked {
+        Asked::Ready(thing) => thing.id.to_string(),
+        Asked::Pending(request) => request.id.to_string(),
+    };
+    let shown = |asked| Ok((id(&asked), Id::body(asked)?));
+    let items = items.into_iter().map(shown).collect::<Result<Vec<_>>>()?;
+    PageBody::new(Page { items, more }, |(id, _)| id.clone(), |(_, body)| body).answer(request)
+}
+
+pub(super) async fn show<Id: Shown>(
+    Caller(app, access): Caller,
+    Params(id): Params<Id>,
+    QueryOf(NoQuery {}): QueryOf<NoQuery>,
+    request: RequestContext,
+) -> Result<Response> {
+    let wait = request.wait();
+    if let Some(time) = app.wait(wait) {
+        let resource = (Id::KIND, id.into());
+        app.events.settled(&app.store, &access.lab, resource, time).await?;
+    }
+    Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
+}
+
+pub(super) async fn rename<Id: Shown>(
+    Caller(app, access): Caller,
+    Params(id): Params<Id>,
+    request: RequestContext,
+    Body(renaming): Body<Renaming>,
+) -> Result<Response> {
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
+    app.store.rename(&access.lab, id, renaming.name.as_ref()).await?;
+    changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
+}
+
+pub(super) async fn delete<Id: Shown>(
+    Caller(app, access): Caller,
+    Params(id): Params<Id>,
+    request: RequestContext,
+) -> Result<StatusCode> {
+    let _guard =
+        request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
+    app.store.delete(&access.lab, id).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 /// State of a pending request; if it failed, the reason in words and as a problem.

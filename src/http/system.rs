@@ -208,7 +208,7 @@ fn device_state(app: &App) -> String {
 async fn database_answers(app: &App) -> Result<(), String> {
     app.store.ping().await.map_err(|_| "the database does not answer".to_owned())?;
     app.store.check_database_file().map_err(|_| {
-        "its file was removed or replaced: stop the service, and restore the file or a backup"
+        "a file of it was removed, replaced or truncated: stop the service, and restore the file or a backup"
             .to_owned()
     })?;
     app.store.database_damage().map_or(Ok(()), |_| {
@@ -233,6 +233,8 @@ async fn disk_takes_files(app: &App) -> Result<(), String> {
     }
     let result = app.store.try_disk().await.map_err(|error| match error {
         StoreError::Io { source, .. } => format!("no file can be written: {}", source.kind()),
+        error if error.is_damage() => "the database is damaged: restore a backup".to_owned(),
+        StoreError::Database(_) => "the database can't be changed; the log says why".to_owned(),
         _ => "no file can be written".to_owned(),
     });
     *tried = Some((Instant::now(), result.clone()));

@@ -8,10 +8,10 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, captures, colour, compare, decided, judged, manage, movie, network, sample, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, captures, colour, compare, decided, judged, manage, mended, moved, movie, network, sample, spectrum, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
-import { scene } from "./scene.mjs";
+import { scene, spectral } from "./scene.mjs";
 import { access, faults, loading, phone, reference } from "./states.mjs";
 
 const FRAMES = 8;
@@ -56,6 +56,16 @@ async function everything() {
   await checks.step("captures", () => captures(page, checks, small));
   await checks.step("colour", () => colour(page, checks, scene(FRAMES, 192, 256, 1, true)));
   await checks.step("movie in colour", () => movie(page, checks, [FRAMES, 192, 256]));
+  await checks.step("mended", () => mended(page, checks, service));
+  await checks.step("spectral", () => spectrum(page, checks, spectral(6, 64, 96, 2), 6));
+  const drifting = scene(FRAMES, 128, 128, 3);
+  const { calibration } = await service.take(drifting);
+  const shifted = await service.call("POST", "/v1/blobs", drifting.moved(2, -1));
+  const drifted = await service.call("POST", "/v1/measurements", { calibration, data: shifted.sha256 });
+  const registered = await service.submit({ measurement: drifted.id, algorithm: "gap-tv", label: "moved masks" });
+  await service.when(registered.id, (job) => job.state === "succeeded");
+  await page.goto(`${service.url}/#/jobs/${registered.id}`);
+  await checks.step("moved", () => moved(page, checks));
   await checks.step("phone", () => phone(browser, checks, service.url, id));
   await checks.step("loading", () => loading(browser, checks, service.url));
   await checks.step("reference", () => reference(browser, checks, service.url));
@@ -74,6 +84,9 @@ async function everything() {
 
 /** Checks the views that need no interaction. */
 async function views(page, service) {
+  const verdict = ".list tr:has(a:text-is('sample')) .checks";
+  await page.waitForSelector(`${verdict}:has-text('dB measured')`);
+  checks.that(!(await page.textContent(verdict)).includes("about"), "the list shows the measured PSNR, not the expected one");
   await checks.look(page, "jobs");
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("table");

@@ -12,14 +12,7 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
   const masks = new Float32Array(frames * height * width);
   const truth = new Float32Array(masks.length);
   const measurement = new Float32Array(height * width);
-  let state = seed >>> 0;
-  const random = () => {
-    // xorshift gives the same numbers on every machine.
-    state ^= state << 13;
-    state ^= state >>> 17;
-    state ^= state << 5;
-    return (state >>> 0) / 2 ** 32;
-  };
+  const random = generator(seed);
   const side = Math.round(Math.min(height, width) / 4);
   for (let frame = 0; frame < frames; frame += 1) {
     const left = Math.round((width - side) * (frame + 0.5) / frames);
@@ -58,9 +51,59 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
       for (let row = 0; row < height; row += 1) picture.set(measurement.subarray(row * width, (row + 1) * width), (row + border) * wide + border);
       return npy([1, height + 2 * border, wide], picture);
     },
+    /** The snapshot behind masks that have moved down and to the right by whole pixels. */
+    moved: (down, right) => {
+      const inside = (place, side) => Math.min(side - 1, Math.max(0, place));
+      const moved = new Float32Array(pixels);
+      for (let at = 0; at < masks.length; at += 1) {
+        const [frame, row, column] = [Math.floor(at / pixels), Math.floor(at / width) % height, at % width];
+        moved[at % pixels] += truth[at] * masks[frame * pixels + inside(row - down, height) * width + inside(column - right, width)];
+      }
+      return npy([1, height, width], moved);
+    },
     /** A MATLAB file (level 5) with masks and snapshot under names of somebody's own. */
     matlab: () => mat([["patterns", [height, width, frames], masks], ["shots", [height, width], measurement]]),
     truth: npy([frames, height, width], truth),
+  };
+}
+
+/** Simulates a spectral camera: one mask, and bands that are displaced to the right by `step` pixels each. A square in the left
+ * half is bright in the first bands, one in the right half in the last. */
+export function spectral(bands, height, width, step) {
+  const { masks, truth } = planes(bands, height, width);
+  const wide = width + step * (bands - 1);
+  const measurement = new Float32Array(height * wide);
+  for (let at = 0; at < truth.length; at += 1) {
+    const [band, row, column] = [Math.floor(at / (height * width)), Math.floor(at / width) % height, at % width];
+    measurement[row * wide + column + step * band] += masks[row * width + column] * truth[at];
+  }
+  return { mask: npy([height, width], masks.slice(0, height * width)), measurement: npy([1, height, wide], measurement), truth: npy([bands, height, width], truth) };
+}
+
+function planes(bands, height, width) {
+  const truth = new Float32Array(bands * height * width).fill(0.1);
+  const [top, bottom] = [Math.round(height / 4), Math.round((3 * height) / 4)];
+  for (let band = 0; band < bands; band += 1) {
+    const early = band < bands / 2 ? 0.9 : 0.2;
+    for (let row = top; row < bottom; row += 1) {
+      for (let column = Math.round(width / 8); column < Math.round((7 * width) / 8); column += 1) {
+        if (Math.abs(column - width / 2) < width / 16) continue;
+        truth[(band * height + row) * width + column] = column < width / 2 ? early : 1.1 - early;
+      }
+    }
+  }
+  const random = generator(5);
+  return { truth, masks: Float32Array.from({ length: height * width }, () => (random() < 0.5 ? 0 : 1)) };
+}
+
+/** Random numbers by xorshift, which are the same on every machine. */
+function generator(seed) {
+  let state = seed >>> 0;
+  return () => {
+    state ^= state << 13;
+    state ^= state >>> 17;
+    state ^= state << 5;
+    return (state >>> 0) / 2 ** 32;
   };
 }
 

@@ -1,22 +1,17 @@
 """Validates the samples under deploy/ and docker/ with the programs that read them.
 
-Usage: deploy.py ROOT PROGRAM, a checkout and its build of sci-recon. Lists checks that were skipped because a program is
-not installed. Ends with 1 and the reasons if a sample is invalid.
+Usage: deploy.py ROOT PROGRAM TOOLS, a checkout, its build of sci-recon, and a folder for JavaScript clients. Lists checks
+that were skipped because a program is not installed. Ends with 1 and the reasons if a sample is invalid.
 """
 
-import contextlib
 import json
 import os
 import pathlib
 import re
 import shutil
-import socket
-import ssl
 import subprocess
 import sys
 import tempfile
-import time
-import urllib.error
 import urllib.request
 
 import kubernetes_validate
@@ -24,17 +19,13 @@ import yaml
 from docker.utils.build import exclude_paths
 
 from image import services
+from proxies import proxies, run, served
 
 VERSION = "1.31"
 # Largest exposure that `systemd-analyze security` may report, in tenths.
 EXPOSURE = 30
 # An image name that no sample has. Kustomize must insert it everywhere.
 IMAGE = {"newName": "registry.example/sci-recon", "newTag": "1.2.3"}
-
-
-def run(*command, **options):
-    done = subprocess.run(command, capture_output=True, text=True, **options)
-    return done.returncode, done.stdout + done.stderr
 
 
 def kubernetes(root, wrong):
@@ -348,85 +339,6 @@ def unreadable(text):
             yield f"DynamicUser= can't read {path.group()}: {line}"
 
 
-def nginx(root, wrong, program):
-    server = shutil.which("nginx", path=os.environ.get("PATH", "") + ":/usr/sbin")
-    if not server or not shutil.which("openssl"):
-        return "nginx"
-    with tempfile.TemporaryDirectory() as folder, served(program, folder) as url:
-        key, certificate, port = f"{folder}/key.pem", f"{folder}/cert.pem", free_port()
-        run("openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", certificate,
-            "-days", "1", "-subj", "/CN=bench.example")
-        site = (root / "deploy/nginx/sci-recon.conf").read_text()
-        for original, replacement in [("/etc/ssl/bench.example.pem", certificate), ("/etc/ssl/private/bench.example.key", key),
-                            ("listen 443 ", f"listen 127.0.0.1:{port} "), ("127.0.0.1:8080;", url.removeprefix("http://") + ";")]:
-            if original not in site:
-                wrong.append(f"deploy/nginx/sci-recon.conf does not contain {original}")
-            site = site.replace(original, replacement)
-        configuration = pathlib.Path(folder, "nginx.conf")
-        configuration.write_text(f"daemon off; pid {folder}/pid; error_log {folder}/log; events {{}} "
-                         f"http {{ access_log off; {site} }}")
-        status, output = run(server, "-t", "-q", "-c", str(configuration))
-        if status:
-            wrong.append(f"nginx -t: {output}")
-            return None
-        proxy = subprocess.Popen([server, "-c", str(configuration)])
-        try:
-            for path in ["/v1/jobs", "/sci/v1/jobs"]:
-                own = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", f"https://bench.example:{port}")
-                other = refusal(f"https://127.0.0.1:{port}{path}", f"bench.example:{port}", "https://other.example")
-                if own == "foreign_site" or other != "foreign_site":
-                    wrong.append(f"behind nginx at {path} a page of the service gets {own}, one of another site {other}")
-        finally:
-            proxy.terminate()
-            proxy.wait()
-    return None
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return listener.getsockname()[1]
-
-
-@contextlib.contextmanager
-def served(program, folder, before=(), workers=0):
-    """Starts a service without tokens for the name bench.example; `before` precedes its command. Yields its address."""
-    line = [*before, program, "serve", "--data", f"{folder}/data", "--listen", "127.0.0.1:0", "--workers", str(workers),
-            "--host", "bench.example"]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
-        try:
-            yield json.loads(server.stdout.readline())["url"]
-        finally:
-            server.terminate()
-
-
-def refusal(url, host, origin):
-    """Code of the problem with which the service refuses a change from a page of `origin`."""
-    request = urllib.request.Request(url, b"{}", {"Host": host, "Origin": origin, "Content-Type": "application/json"})
-    context = ssl._create_unverified_context()
-    start = time.monotonic()
-    while True:
-        try:
-            urllib.request.urlopen(request, timeout=20, context=context).close()
-            return None
-        except urllib.error.HTTPError as error:
-            return json.load(error)["code"]
-        except urllib.error.URLError:
-            # The service is still starting.
-            if time.monotonic() - start > 10:
-                raise
-            time.sleep(0.1)
-
-
-def caddy(root, wrong):
-    if not shutil.which("caddy"):
-        return "caddy"
-    file = str(root / "deploy/caddy/Caddyfile")
-    status, output = run("caddy", "adapt", "--adapter", "caddyfile", "--config", file)
-    if status:
-        wrong.append(f"caddy adapt: {output}")
-    return None
-
-
 def figures(root, wrong):
     board = json.loads((root / "deploy/grafana/sci-recon.json").read_text())
     known(root, wrong, "sci-recon.json", [target["expr"] for panel in board["panels"]
@@ -467,8 +379,9 @@ def main():
     kubernetes(root, wrong)
     figures(root, wrong)
     context(root, wrong, program)
-    absent = [check(root, wrong, program) for check in (kustomize, image, nginx, filtered)]
-    absent += [check(root, wrong) for check in (compose, systemd, caddy, promtool)]
+    absent = [check(root, wrong, program) for check in (kustomize, image, filtered)]
+    absent += [check(root, wrong) for check in (compose, systemd, promtool)]
+    absent.append(proxies(root, wrong, program, pathlib.Path(sys.argv[3]).resolve()))
     absent = [name for name in absent if name]
     if absent:
         print(f"SKIPPED: {', '.join(absent)} not installed", file=sys.stderr)

@@ -423,6 +423,9 @@ def refused():
     Image.fromarray(EIGHT[0]).save(path(row, "in.gif", frames=1), "bmp")
     row = "JPEG"
     pages[0].save(path(row, "in.jpg"))
+    row = "PNM"
+    for frame in [EIGHT[0], np.stack([EIGHT[0]] * 3, -1), (MASKS[0] * 65535).astype("u2")]:
+        Image.fromarray(frame).save(path(row, "in.pgm", frames=1), "ppm")
     row = "JPEG 2000"
     for codec in ["jp2", "j2k"]:
         data = imagecodecs.jpeg2k_encode((MASKS[0] * 65535).astype("u2"), level=0, codecformat=codec)

@@ -259,7 +259,7 @@ fn mismatched_inputs_are_rejected_with_the_reason() {
         ["four/masks.npy", "four/measurement.npy", "clip.npy"].map(|name| files.text(name));
     std::fs::write(files.path("small.npy"), npy(&[20, 30], (0..600).map(|_| 0.5))).unwrap();
     let small = files.text("small.npy");
-    let base = ["reconstruct", "--algorithm", "gap-tv", "--masks"];
+    let base = ["reconstruct", "--algorithm", "gap-tv", "--json", "--masks"];
     let run = |masks: &str, more: &[&str]| rejection(&[&base[..], &[masks], more].concat());
     let sizes = run(&masks, &["--measurement", &small]);
     assert!(sizes.contains("20x30") && sizes.contains("48x64"), "{sizes}");

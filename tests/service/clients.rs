@@ -6,7 +6,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 
 use crate::app::{Answer, TestApp, id};
-use crate::samples::Scene;
+use crate::samples::{Scene, npy};
 
 async fn with_key(app: &TestApp, path: &str, key: &str, body: &Value) -> Answer {
     let request = app.request(Method::POST, path).header("idempotency-key", key);
@@ -299,4 +299,12 @@ async fn a_sample_runs_without_uploads() {
     let path = format!("/v1/jobs/{job}/snapshots/0/quality");
     let psnr = app.get(&path).await.expect(200).json()["psnr"].as_f64().unwrap();
     assert!(psnr > 18.0, "{psnr} dB");
+    // A truth with a value that is no number would have no PSNR.
+    let value = |at| if at == 70_000 { f32::NAN } else { 0.5 };
+    let odd = app.upload(npy(&[8, 256, 256], (0..8 * 65_536).map(value))).await;
+    let job = format!("/v1/jobs/{job}");
+    let refused = patch(&app, &job, &json!({ "truth": odd })).await;
+    let detail = refused.problem(422, "invalid_content");
+    assert!(detail.contains("frame 1, row 17, column 112"), "{detail}");
+    app.get(&format!("{path}?truth={odd}")).await.problem(422, "invalid_content");
 }

@@ -170,12 +170,25 @@ async fn changes_are_refused_while_the_database_is_missing_or_another() {
     let names = ["sci-recon.db", "sci-recon.db-wal", "sci-recon.db-shm"];
     let refused = async || {
         let ready = app.get_until("/readyz", 503).await.json();
-        assert!(ready["database"].as_str().unwrap().contains("removed or replaced"), "{ready}");
+        assert!(ready["database"].as_str().unwrap().contains("removed, replaced"), "{ready}");
         let upload = app.request(Method::POST, "/v1/blobs").body("important");
         app.send(upload).await.problem(503, "unavailable");
         let begin = app.request(Method::POST, "/v1/uploads").header("tus-resumable", "1.0.0");
         app.send(begin.header("upload-length", 10)).await.problem(503, "unavailable");
     };
+    for name in names {
+        std::fs::rename(app.data().join(name), aside.join(name)).unwrap();
+        refused().await;
+        // A command must not create the file: the service would not see its changes.
+        let mut create = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        create.args(["token", "--data"]).arg(app.data()).args(["create", "--lab", "a"]);
+        let output = create.output().unwrap();
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && text.contains("removed, replaced"), "{name}: {text}");
+        assert!(!app.data().join(name).exists(), "{name}");
+        std::fs::rename(aside.join(name), app.data().join(name)).unwrap();
+        app.get_until("/readyz", 200).await;
+    }
     for name in names {
         std::fs::rename(app.data().join(name), aside.join(name)).unwrap();
     }

@@ -317,7 +317,30 @@ async fn a_service_starts_on_a_full_disk_and_deletes() {
     app.get(&format!("/v1/jobs/{job}")).await.problem(404, "not_found");
     std::fs::remove_file(&filling).unwrap();
     app.upload(b"abc".to_vec()).await;
-    drop(app);
+    app.kill();
+    app.restart();
+    let reserve = self::reserve(&app).await;
+    // Commands give up the reserve, too, so that a token can always be revoked.
+    let token = |arguments: &[&str]| {
+        let mut token = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        token.args(["token", "--data"]).arg(app.data()).args(arguments).output().unwrap()
+    };
+    let note = "n".repeat(200);
+    let created = token(&["create", "--lab", "a", "--role", "submit", "--note", &note]);
+    app.sign_in(String::from_utf8(created.stdout).unwrap().trim());
+    let id = app.get("/v1/me").await.expect(200).json()["token"].as_str().unwrap().to_owned();
+    fill(&filling);
+    // The write-ahead log grows after a few changes.
+    let mut created = true;
+    for _ in 0..100 {
+        created = token(&["create", "--lab", "a", "--note", &note]).status.success();
+        if !reserve.exists() {
+            break;
+        }
+    }
+    assert!(created && !reserve.exists(), "the reserve is given up");
+    assert!(token(&["revoke", &id]).status.success());
+    app.get("/v1/jobs").await.problem(401, "unauthorized");
 }
 
 #[tokio::test]

@@ -363,7 +363,7 @@ scipy.io.savemat('masks.mat', {'codes': masks.transpose(1, 2, 0), 'other': masks
     let run = |masks: &str, more: &[&str]| {
         let mut reconstruct = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         reconstruct.args(["reconstruct", "--masks", masks, "--measurement", "y.npy"]);
-        reconstruct.args(["--algorithm", "gap-tv", "--iterations", "3"]).args(more);
+        reconstruct.args(["--algorithm", "gap-tv", "--iterations", "3", "--json"]).args(more);
         reconstruct.current_dir(&folder).output().unwrap()
     };
     std::fs::write(folder.path().join("y.npy"), Scene::SMALL.snapshots()).unwrap();

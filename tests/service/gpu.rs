@@ -88,6 +88,29 @@ fn commands_name_the_remedy_of_a_missing_device() {
     assert!(trials.iter().all(|trial| trial["usable"] == false), "{report}");
 }
 
+/// A stated 8-bit network is replaced for all tiles, and the manifest says what ran where.
+#[tokio::test]
+async fn jobs_of_a_service_with_a_gpu_use_the_32_bit_network() {
+    let Some(library) = webgpu() else { return };
+    let options = ["--workers", "1", "--device", "gpu", "--onnxruntime", &library];
+    let app = TestApp::in_environment(&options, &[("VK_ICD_FILENAMES", ICD)]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "pnp-tv-fastdvdnet", "snapshots": 0, "schedule": {"stages": [
+        {"prior": "tv", "iterations": 4, "tv_weight": 0.15},
+        {"prior": "fastdvdnet-int8", "iterations": 1, "sigma": [0.1, 0.1]}]}});
+    let job = app.submit(&body).await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    assert_eq!(done["schedule"]["stages"][1]["prior"], "fastdvdnet", "{done:#}");
+    let place = format!("/v1/jobs/{job}/snapshots/0/exports/manifest");
+    let manifest = app.get(&place).await.expect(200).json();
+    let models = manifest["content"]["models"].as_array().unwrap();
+    assert_eq!((models.len(), &models[0]["name"]), (1, &json!("fastdvdnet-gray")), "{manifest}");
+    assert_eq!(manifest["run"]["provider"], "WebGpuExecutionProvider");
+    let gpu = manifest["run"]["gpu"].as_str().unwrap_or_default();
+    assert_eq!(gpu.contains("SwiftShader"), cfg!(feature = "gpu"), "{manifest}");
+}
+
 #[test]
 fn software_vulkan_computes_what_the_cpu_computes() {
     let Some(library) = webgpu() else { return };

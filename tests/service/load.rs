@@ -242,14 +242,12 @@ const COPIES: [&str; 13] = [
      FROM numbers, (SELECT * FROM blobs LIMIT 1) WHERE n <= 2 * ?3",
     "INSERT INTO holdings (lab, sha256, created_at, touched_at)
      SELECT 'local', sha256, created_at, touched_at FROM blobs WHERE origin = 'upload' AND size = 1000",
-    "INSERT INTO requests (id, what, lab, calibration, request, limits, created_at)
-     SELECT printf('01a00000-0000-7000-9000-%012d', n), what, lab, calibration, request, limits, created_at
+    "INSERT INTO requests (id, what, lab, calibration, request, limits, created_at, prepared, facts)
+     SELECT printf('01a00000-0000-7000-9000-%012d', n), what, lab, calibration, request, limits, created_at,
+         printf('%064x', 2 * n), json_set(facts, '$.data', printf('%064x', 2 * n - 1))
      FROM numbers, (SELECT * FROM requests WHERE what = 'measurement' LIMIT 1) WHERE n <= ?3",
-    "INSERT INTO measurements (id, lab, calibration, data, prepared, format, sample, axes, snapshots, height,
-         width, full_scale, sequence, created_at)
-     SELECT printf('01a00000-0000-7000-9000-%012d', n), lab, calibration, printf('%064x', 2 * n - 1),
-         printf('%064x', 2 * n), format, sample, axes, snapshots, height, width, full_scale, sequence, created_at
-     FROM numbers, (SELECT * FROM measurements LIMIT 1) WHERE n <= ?3",
+    "INSERT INTO request_files (id, sha256)
+     SELECT printf('01a00000-0000-7000-9000-%012d', n), printf('%064x', 2 * n - 1) FROM numbers WHERE n <= ?3",
     "DROP TABLE temp.numbers",
 ];
 

@@ -3,21 +3,16 @@
 use reqwest::Method;
 use serde_json::{Value, json};
 
-use crate::app::{Answer, TestApp};
+use crate::app::{Answer, TestApp, judges};
 use crate::pipeline::values;
-use crate::samples::Scene;
+use crate::samples::{Scene, npy};
 
 /// Rows, columns and values of an 8-bit grey PNG.
 pub fn decode(answer: &Answer) -> (usize, usize, Vec<u8>) {
     assert_eq!(answer.header("content-type"), "image/png");
-    let mut reader = png::Decoder::new(std::io::Cursor::new(&answer.bytes)).read_info().unwrap();
-    let mut values = vec![0; reader.output_buffer_size().unwrap()];
-    let info = reader.next_frame(&mut values).unwrap();
-    assert_eq!(
-        (info.color_type, info.bit_depth),
-        (png::ColorType::Grayscale, png::BitDepth::Eight)
-    );
-    (info.height as usize, info.width as usize, values)
+    let picture = image::load_from_memory(&answer.bytes).unwrap();
+    let image::DynamicImage::ImageLuma8(grey) = picture else { panic!("not 8-bit grey") };
+    (grey.height() as usize, grey.width() as usize, grey.into_raw())
 }
 
 async fn job(app: &TestApp, schedule: Value) -> String {
@@ -84,6 +79,24 @@ async fn images_show_the_frames_unchanged() {
     let rest = app.get(&format!("{pictures}/residual/spread")).await.expect(200).json();
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
     app.get(&format!("{pictures}/difference-2")).await.expect(200);
+
+    // The true error is the frame minus the true frame, of this snapshot or of all.
+    app.get(&format!("{pictures}/deviation-1")).await.problem(404, "not_found");
+    for first in [0, Scene::SMALL.frames] {
+        let shape = [first + Scene::SMALL.frames, height, width];
+        let true_value = |at: usize| if at < first * plane { 9.0 } else { (at % plane) as f32 };
+        let truth = npy(&shape, (0..shape[0] * plane).map(true_value));
+        let truth = json!({"truth": app.upload(truth).await});
+        let change = app.request(Method::PATCH, &format!("/v1/jobs/{job}")).json(&truth);
+        app.send(change).await.expect(200);
+        let error = app.get(&format!("{pictures}/deviation-2/values/0/0/0")).await.expect(200);
+        for (at, error) in error.bytes.chunks(4).enumerate() {
+            let error = f32::from_le_bytes(error.try_into().unwrap());
+            let expected = frames[plane + at] - at as f32;
+            assert!((error - expected).abs() < 1e-3, "{at}: {error} {expected}");
+        }
+    }
+    app.get(&format!("{pictures}/colours")).await.problem(404, "not_found");
 
     // Masks and measurement have images too.
     let (calibration, measurement) = (&done["calibration"], &done["measurement"]);
@@ -260,4 +273,96 @@ async fn a_coarse_preview_precedes_the_tiles() {
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
     let ended = app.ended(&job).await;
     assert_eq!(ended["state"], "cancelled");
+}
+
+/// Runs `tests/judges/pictures.py`, and returns what it prints.
+fn judge(python: &str, action: &str, folder: &std::path::Path) -> String {
+    let mut judge = std::process::Command::new(python);
+    let output = judge.arg("tests/judges/pictures.py").arg(action).arg(folder).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[tokio::test]
+async fn accept_chooses_the_encoding_of_a_picture() {
+    let app = TestApp::start().await;
+    let ramp = (0..60 * 100).map(|at| (at % 100) as f32 / 100.0);
+    let sha256 = app.upload(npy(&[1, 60, 100], ramp)).await;
+    let address = format!("/view/blobs/{sha256}/pictures/frame-1?black=0&white=1");
+    let get = |accept: &str| app.request(Method::GET, &address).header("accept", accept);
+    let folder = tempfile::tempdir().unwrap();
+    let mut tags = std::collections::BTreeSet::new();
+    for kind in ["png", "webp", "jpeg"] {
+        let answer = app.send(get(&format!("image/{kind}, text/html"))).await.expect(200);
+        assert_eq!(answer.header("content-type"), format!("image/{kind}"));
+        assert_eq!(answer.header("vary"), "accept");
+        let tag = answer.header("etag").to_owned();
+        let known = get(&format!("image/{kind}")).header("if-none-match", &tag);
+        let known = app.send(known).await.expect(304);
+        assert_eq!((known.header("etag"), known.header("vary")), (&*tag, "accept"));
+        assert!(tags.insert(tag), "each encoding has its ETag");
+        std::fs::write(folder.path().join(format!("picture.{kind}")), &answer.bytes).unwrap();
+    }
+    for any in ["*/*", "image/*", "text/html, */*;q=0.1", "image/webp;q=0.2, image/png"] {
+        let answer = app.send(get(any)).await.expect(200);
+        assert_eq!(answer.header("content-type"), "image/png", "{any}");
+    }
+    for none in ["text/html", "application/json", "image/avif", "*/*;q=0"] {
+        let refused = app.send(get(none)).await;
+        let detail = refused.problem(406, "not_acceptable");
+        assert!(detail.contains("image/webp"), "{detail}");
+        assert_eq!(refused.header("vary"), "accept");
+    }
+    let Some(python) = judges() else { return };
+    let report: Value = serde_json::from_str(&judge(&python, "read", folder.path())).unwrap();
+    assert_eq!(report["png"], json!(["PNG", 100, 60, "L", 0.0]), "{report}");
+    assert_eq!(report["webp"][4], 0.0, "lossless: {report}");
+    assert_eq!((&report["webp"][0], &report["webp"][1]), (&json!("WEBP"), &json!(100)));
+    assert_eq!(
+        report["jpeg"].as_array().unwrap()[..4],
+        json!(["JPEG", 100, 60, "L"]).as_array().unwrap()[..]
+    );
+    assert!(report["jpeg"][4].as_f64().unwrap() < 16.0, "{report}");
+}
+
+#[tokio::test]
+async fn true_frames_may_be_8_bit_pictures_and_measurements_may_not() {
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let scene = Scene::SMALL;
+    let shape = [scene.frames, scene.height, scene.width];
+    let frames = (0..shape.iter().product()).map(|at: usize| {
+        let (row, column) = (at / scene.width % scene.height, at % scene.width);
+        scene.pixel(1, at / (scene.height * scene.width), row, column)
+    });
+    std::fs::write(folder.path().join("truth.npy"), npy(&shape, frames)).unwrap();
+    judge(&python, "write", folder.path());
+    let upload =
+        async |name: &str| app.upload(std::fs::read(folder.path().join(name)).unwrap()).await;
+    let job = job(&app, tv(60, 4)).await;
+    app.ended(&job).await;
+    let psnr = async |truth: String| {
+        let path = format!("/v1/jobs/{job}/snapshots/1/quality?truth={truth}");
+        app.get(&path).await.expect(200).json()["psnr"].as_f64().unwrap()
+    };
+    let expected = psnr(upload("truth8.npy").await).await;
+    for (name, tolerance) in [("bmp.zip", 0.0), ("pgm.zip", 0.0), ("jpg.zip", 1.0)] {
+        let found = psnr(upload(name).await).await;
+        assert!((found - expected).abs() <= tolerance, "{name}: {found} {expected}");
+    }
+    let picture = upload("frame.jpg").await;
+    let detail = app
+        .post("/v1/calibrations", &json!({"masks": picture}))
+        .await
+        .problem(422, "invalid_content");
+    assert!(detail.contains("JPEG") && detail.contains("lossy"), "{detail}");
+    let shown = app.get(&format!("/view/blobs/{picture}/pictures/frame-1")).await.expect(200);
+    assert_eq!(decode(&shown).0, scene.height);
+    // A truth of one frame does not fit.
+    let path = format!("/v1/jobs/{job}/snapshots/1/quality?truth={picture}");
+    app.get(&path).await.problem(422, "size_mismatch");
+    let archive = app.post("/v1/calibrations", &json!({"masks": upload("jpg.zip").await})).await;
+    let detail = archive.problem(422, "invalid_content");
+    assert!(detail.contains("neither PNG nor TIFF"), "{detail}");
 }

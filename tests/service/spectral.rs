@@ -154,6 +154,8 @@ async fn bands_come_back_in_their_place() {
     assert_eq!((&spread["height"], &spread["width"]), (&json!(96), &json!(96)), "{spread}");
     let rest = app.get(&format!("{}/spread", view("residual"))).await.expect(200).json();
     assert!(rest["maximum"].as_f64().unwrap() < 0.1, "{rest}");
+    let colours = app.get(&format!("{}/values/0/0/0", view("colours"))).await.expect(200).bytes;
+    assert_eq!(colours.len(), 96 * 96 * 3 * 4);
     let errors = app.get(&format!("{base}/exports/error")).await.expect(200).bytes;
     assert!(String::from_utf8_lossy(&errors[..128]).contains("(8, 6, 6)"));
 
@@ -264,6 +266,7 @@ async fn a_dispersion_that_does_not_fit_is_refused_with_the_expected_size() {
         "sim/masks.npy",
         "--dispersion-offsets",
         "0:2:8",
+        "--json",
     ];
     let output = lab.command(&line);
     let text = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -93,7 +93,7 @@ fn verify(data: &Path) -> Value {
 }
 
 async fn prepared(app: &TestApp, calibration: &str) -> Option<String> {
-    let query = "SELECT prepared FROM calibrations WHERE id = ?";
+    let query = "SELECT prepared FROM requests WHERE id = ?";
     let masks = sqlx::query_scalar(query).bind(calibration);
     masks.fetch_optional(&mut app.database().await).await.unwrap()
 }

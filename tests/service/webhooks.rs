@@ -33,7 +33,7 @@ async fn job_when(app: &TestApp, job: &str, state: &str) -> Value {
     let start = Instant::now();
     loop {
         let found = app.get(&format!("/v1/jobs/{job}")).await.expect(200).json();
-        if found["webhook"]["state"] == state && found["webhook"]["attempts"] != json!(0) {
+        if found["webhook"]["state"] == state && found["webhook"]["error"].is_string() {
             return found;
         }
         assert!(start.elapsed() < Duration::from_secs(60), "{found}");
@@ -148,4 +148,37 @@ async fn a_command_runs_when_a_job_has_ended() {
     let output = run("exit 7");
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stderr).contains("exit status: 7"), "{output:?}");
+}
+
+#[tokio::test]
+async fn a_silent_receiver_delays_no_other_lab() {
+    let silent = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let other = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let [dead, live] = [&silent, &other].map(|listener| listener.local_addr().unwrap().to_string());
+    let app = TestApp::with(&["--workers", "0", "--webhook-host", &format!("{dead},{live}")]).await;
+    let [red, blue] =
+        ["red", "blue"].map(|lab| app.token(&["create", "--lab", lab, "--role", "submit"]));
+    let end_jobs = async |token: &str, host: &str, jobs: usize| {
+        app.sign_in(token);
+        let (_, measurement) = app.scene(&Scene::SMALL).await;
+        let body = json!({"measurement": measurement, "algorithm": "gap-tv", "webhook": format!("http://{host}/")});
+        for _ in 0..jobs {
+            let job = app.submit(&body).await;
+            app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
+        }
+    };
+    tokio::spawn(async move {
+        let mut connections = Vec::new();
+        while let Ok((connection, _)) = silent.accept().await {
+            connections.push(connection);
+        }
+    });
+    end_jobs(&red, &dead, 80).await;
+    let received = receive(other);
+    let start = Instant::now();
+    end_jobs(&blue, &live, 1).await;
+    while received.lock().unwrap().is_empty() {
+        assert!(start.elapsed() < Duration::from_secs(30), "it waits for the other lab");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
 }

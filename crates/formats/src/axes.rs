@@ -7,12 +7,10 @@ use super::{Format, FormatError};
 use crate::error::Result;
 
 /// The order of the axes of an array, as shown by h5py for HDF5 files and by MATLAB for its files.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Display, EnumString, VariantNames,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, Display, EnumString, VariantNames, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case")]
-#[derive(schemars::JsonSchema)]
 pub enum Axes {
     /// \[frame, row, column\].
     FrameRowColumn,

@@ -3,11 +3,13 @@
 use std::path::Path;
 
 use super::open::open;
+use super::photo::{Photo, read_picture};
 use super::{Format, FrameReader, Limits, npy, png};
 use crate::error::Result;
 
-/// Opens a colour clip: npy (frame, row, column, 3) in C order, or an RGB PNG with 8 or 16 bits per channel. Its
-/// frames, and their stated width, are three times as wide as the picture. `None` if the file is not in colour.
+/// Opens a colour clip: npy (frame, row, column, 3) in C order, or a picture in colours: a PNG with 8 or 16 bits per
+/// channel, or a JPEG, BMP or PNM with 8. Its frames, and their stated width, are three times as wide as the picture.
+/// `None` if the file is not in colour.
 ///
 /// Errors: as [`super::open_stack`].
 pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Box<dyn FrameReader + Send>>> {
@@ -22,6 +24,11 @@ pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Box<dyn Frame
             let reader = png::PngReader::open_colours(file, length, limits)?;
             reader.map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
         }
+        Format::Jpeg | Format::Bmp | Format::Pnm => {
+            let bytes = read_picture(file, (format, length))?;
+            let reader = Photo::open_colours(&bytes, format, limits)?;
+            reader.map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
+        }
         _ => None,
     })
 }
@@ -31,8 +38,9 @@ mod tests {
     use ndarray::Array3;
 
     use super::open_colours;
+    use crate::display::{Encoding, Picture};
     use crate::test_support::file;
-    use crate::{Channels, Limits, collect, npy, open_stack, png};
+    use crate::{Channels, Limits, collect, npy, open_stack};
 
     #[test]
     fn colour_clips_are_distinguished_from_grey_ones() {
@@ -52,13 +60,17 @@ mod tests {
         assert!(open_colours(path.path(), &Limits::default()).unwrap().is_none());
 
         let frame = frames.index_axis(ndarray::Axis(0), 1).mapv(|value| value / 255.0);
-        let bytes = png::encode_u8(frame.view(), Channels::Rgb, 0.0, 1.0).unwrap();
+        let png = |channels| {
+            let picture = Picture::new(frame.view(), channels, (0.0, 1.0)).unwrap();
+            picture.encode(Encoding::Png).unwrap()
+        };
+        let bytes = png(Channels::Rgb);
         let picture = file(&bytes);
         let mut reader = open_colours(picture.path(), &Limits::default()).unwrap().unwrap();
         assert_eq!((reader.info().height, reader.info().width), (3, 12));
         assert_eq!(reader.next_frame().unwrap().unwrap(), frames.index_axis(ndarray::Axis(0), 1));
         assert!(reader.next_frame().unwrap().is_none());
-        let grey = file(&png::encode_u8(frame.view(), Channels::Grey, 0.0, 1.0).unwrap());
+        let grey = file(&png(Channels::Grey));
         assert!(open_colours(grey.path(), &Limits::default()).unwrap().is_none());
         let cut = file(&bytes[..bytes.len() - 30]);
         let read = open_colours(cut.path(), &Limits::default())

@@ -29,6 +29,15 @@ pub enum Format {
     /// PNG, one frame.
     #[strum(serialize = "PNG")]
     Png,
+    /// JPEG, one frame.
+    #[strum(serialize = "JPEG")]
+    Jpeg,
+    /// BMP, one frame.
+    #[strum(serialize = "BMP")]
+    Bmp,
+    /// PBM, PGM, PPM or PAM, one frame.
+    #[strum(serialize = "PNM")]
+    Pnm,
     /// MATLAB level 5 file.
     #[strum(serialize = ".mat")]
     Mat,
@@ -67,6 +76,8 @@ impl Format {
             Some(Self::Tiff)
         } else if head.starts_with(b"\x89PNG\r\n\x1a\n") {
             Some(Self::Png)
+        } else if head.starts_with(b"\xff\xd8\xff") {
+            Some(Self::Jpeg)
         } else if head.starts_with(HDF5_MAGIC) || head.starts_with(b"MATLAB 7.3") {
             Some(Self::Hdf5)
         } else if head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06") {
@@ -82,6 +93,15 @@ impl Format {
                 Some(version) if version == LITTLE_ENDIAN_MAT || version == BIG_ENDIAN_MAT => {
                     Some(Self::Mat)
                 }
+                // Short signatures last.
+                _ if head.starts_with(b"BM") => Some(Self::Bmp),
+                _ if matches!(
+                    head,
+                    [b'P', b'1'..=b'7', b' ' | b'\n' | b'\r' | b'\t' | b'#', ..]
+                ) =>
+                {
+                    Some(Self::Pnm)
+                }
                 _ => None,
             }
         }
@@ -95,14 +115,21 @@ pub(super) fn describe(head: &[u8], name: &str) -> String {
                 shutil.copyfileobj(gzip.open('in.gz'), open('out', 'wb'))\")"
             .to_owned();
     }
-    if head.starts_with(b"GIF8") || head.starts_with(b"BM") {
-        return "it is a GIF or BMP (to convert its grey values: python -c \"import numpy; from PIL import Image, ImageSequence; \
+    let format = Format::sniff(head);
+    if head.starts_with(b"GIF8") || format == Some(Format::Bmp) {
+        return "it is a GIF or BMP, with 8 bits (to convert its grey values: python -c \"import numpy; from PIL import Image, ImageSequence; \
                 numpy.save('out.npy', [numpy.array(page.convert('L')) for page in \
                 ImageSequence.Iterator(Image.open('in.gif'))])\")"
             .to_owned();
     }
-    if head.starts_with(b"\xff\xd8\xff") {
-        return "it is a JPEG, which is lossy: save the pictures as PNG, TIFF or npy instead"
+    if format == Some(Format::Jpeg) {
+        return "it is a JPEG, which is lossy, so only true frames may be JPEG: save the pictures as PNG, TIFF or npy instead"
+            .to_owned();
+    }
+    if format == Some(Format::Pnm) {
+        return "it is a PNM (to convert its grey values: python -c \"import numpy; from PIL import Image; \
+                a = numpy.array(Image.open('in.pgm')); g = a if a.ndim == 2 else (a @ [.299, .587, .114]).round(); \
+                numpy.save('out.npy', g.astype(a.dtype if a.itemsize < 2 else 'u2'))\")"
             .to_owned();
     }
     if JPEG_2000.iter().any(|magic| head.starts_with(magic)) {

@@ -26,7 +26,7 @@ use super::array::{self, ArrayReader, Samples};
 use super::axes::{Expected, Writer};
 use super::samples::{self, ByteOrder};
 use super::scene::{SceneArray, list};
-use super::{Format, FormatError, FrameReader, Limits, SampleType};
+use super::{Format, FormatError, FrameReader, Limits, SampleType, limits};
 use crate::error::Result;
 
 /// Size of the cache of decoded chunks, in bytes. If the chunks of a frame fit, each chunk is decoded once for all its
@@ -155,28 +155,28 @@ struct Found {
 /// Finds the array at a path. Octave stores a variable as a group with the arrays `type` and `value`; the path of the
 /// group stands for its value. `None` if there is no array at this path. Errors: those of reading the array.
 fn find(root: &Group, path: &str) -> Result<Option<Found>, Error> {
-    let mut parent = None;
-    let mut group = None;
+    let mut group = root.clone();
     let mut parts = path.split('/').filter(|part| !part.is_empty()).peekable();
+    if parts.peek().is_none() {
+        return Ok(None);
+    }
     while let Some(part) = parts.next() {
-        let current = group.take().unwrap_or_else(|| root.clone());
-        let (groups, arrays) = current.member_names()?;
+        let (groups, arrays) = group.member_names()?;
         if parts.peek().is_none() && arrays.iter().any(|name| name == part) {
-            let octave = if part == "value" { octave_type(&current) } else { None };
-            return Ok(Some(Found { dataset: current.dataset(part)?, octave }));
+            let octave = if part == "value" { octave_type(&group) } else { None };
+            return Ok(Some(Found { dataset: group.dataset(part)?, octave }));
         }
         if !groups.iter().any(|name| name == part) {
             return Ok(None);
         }
-        group = Some(current.group(part)?);
-        parent = Some(());
+        group = group.group(part)?;
     }
-    let (Some(group), Some(())) = (group, parent) else { return Ok(None) };
-    let Some(octave) = octave_type(&group) else { return Ok(None) };
-    match group.member_names()?.1.iter().any(|name| name == "value") {
-        true => Ok(Some(Found { dataset: group.dataset("value")?, octave: Some(octave) })),
-        false => Ok(None),
+    let octave = octave_type(&group);
+    let has_value = group.member_names()?.1.iter().any(|name| name == "value");
+    if octave.is_none() || !has_value {
+        return Ok(None);
     }
+    Ok(Some(Found { dataset: group.dataset("value")?, octave }))
 }
 
 /// The type of the variable that Octave stores in a group.
@@ -322,16 +322,9 @@ fn check_chunks(dataset: &Dataset, sample: SampleType) -> Result<()> {
     let plane =
         round(*height, chunk.iter().rev().nth(1)).saturating_mul(round(*width, chunk.last()));
     let bytes = plane.saturating_mul(depth).saturating_mul(sample.bytes() as u64);
-    if bytes <= CHUNK_CACHE_BYTES as u64 {
-        return Ok(());
-    }
-    Err(FormatError::OverLimit {
-        format: Format::Hdf5,
-        what: "the size in bytes of the chunks for one entry of the first axis (save the array with one entry per chunk, \
-               in h5py chunks=(1, height, width))",
-        value: bytes,
-        limit: CHUNK_CACHE_BYTES as u64,
-    })
+    let what = "the size in bytes of the chunks for one entry of the first axis (save the array with one entry per chunk, \
+                in h5py chunks=(1, height, width))";
+    limits::check(Format::Hdf5, what, bytes, CHUNK_CACHE_BYTES as u64)
 }
 
 impl Advice {

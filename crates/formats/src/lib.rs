@@ -22,6 +22,7 @@ mod natural;
 mod npz;
 mod open;
 mod part;
+mod photo;
 mod pictures;
 mod samples;
 mod scene;
@@ -31,14 +32,16 @@ mod window;
 mod zip;
 
 pub mod clip_tiff;
+pub mod display;
 pub mod exr;
 pub mod gif;
 pub mod mat;
 pub mod movie;
 pub mod npy;
 pub mod planar;
-pub mod png;
+mod png;
 #[cfg(test)]
+#[path = "tests/support.rs"]
 mod test_support;
 mod tiff;
 pub mod validate;
@@ -50,8 +53,8 @@ pub use error::{DiskTrouble, FormatError, Lightless};
 pub use format::Format;
 pub use limits::Limits;
 pub use natural::natural_key;
-pub use open::{Wanted, collect, open_array, open_stack, read_stack};
+pub use open::{Wanted, collect, open_array, open_file, open_shown, open_stack, read_stack};
 pub use part::{Crop, Packing, Part};
 pub use samples::StackWriter;
-pub use stack::{FrameReader, FullScale, SampleType, StackInfo};
+pub use stack::{FrameReader, Frames, FullScale, SampleType, StackInfo};
 pub use window::WindowReader;

@@ -55,9 +55,10 @@ impl Limits {
     }
 }
 
-fn check(format: Format, quantity: &'static str, value: u64, limit: u64) -> Result<()> {
+/// Checks a claimed quantity. Errors: [`FormatError::OverLimit`].
+pub(super) fn check(format: Format, what: &'static str, value: u64, limit: u64) -> Result<()> {
     if value > limit {
-        return Err(FormatError::OverLimit { format, what: quantity, value, limit });
+        return Err(FormatError::OverLimit { format, what, value, limit });
     }
     Ok(())
 }

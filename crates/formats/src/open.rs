@@ -10,6 +10,7 @@ use ndarray::Array3;
 
 use super::format::{HDF5_MAGIC, HEAD_BYTES, describe};
 use super::mat::{self, SceneArray};
+use super::photo::{Photo, read_picture};
 use super::pictures::Pictures;
 use super::scene::list;
 use super::{
@@ -57,11 +58,20 @@ impl From<SceneArray> for Wanted<'_> {
 ///
 /// Errors: [`FormatError`].
 pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
-    open_any(path, None, limits)
+    open_any(path, None, false, limits)
+}
+
+/// Opens a stack of frames to be looked at: as [`open_stack`], or 8-bit pictures in JPEG, BMP or PNM.
+///
+/// Errors: [`FormatError`].
+pub fn open_shown(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
+    open_any(path, None, true, limits)
 }
 
 /// Opens a stack of frames like [`open_stack`], or one array of a .mat, HDF5 or npz file. For MATLAB files
 /// [`StackInfo::default_full_scale`] is [`SceneArray::default_full_scale`].
+///
+/// True frames may also be 8-bit pictures in JPEG, BMP or PNM.
 ///
 /// Packed pixels may also be in a file without a header, if the size of its pictures is known.
 ///
@@ -73,12 +83,13 @@ pub fn open_array<'a>(
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
     let mut wanted = wanted.into();
+    let photos = wanted.array == SceneArray::Truth;
     let Some(packing) = wanted.packing else {
-        return wanted.part.of(open_any(path, Some(wanted), limits)?);
+        return wanted.part.of(open_any(path, Some(wanted), photos, limits)?);
     };
     let size = wanted.expected.size;
     wanted.expected.size = size.map(|(height, width)| (height, packing.stored_width(width)));
-    let unpacked = match open_any(path, Some(wanted), limits) {
+    let unpacked = match open_any(path, Some(wanted), photos, limits) {
         Err(FormatError::UnknownFormat { .. }) => {
             let file = File::open(path).map_err(FormatError::io("open the file"))?;
             let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
@@ -89,16 +100,18 @@ pub fn open_array<'a>(
     wanted.part.of(unpacked)
 }
 
+/// Opens a file. `photos`: 8-bit pictures in JPEG, BMP and PNM are accepted.
 fn open_any(
     path: &Path,
     wanted: Option<Wanted<'_>>,
+    photos: bool,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
     let name = wanted.map_or("mask", |wanted| wanted.name.unwrap_or(wanted.array.name()));
-    let (file, length, format) = open(path, name)?;
+    let (mut file, length, format) = open(path, name)?;
     limits.check_file(format, length)?;
     if format == Format::Zip {
-        return open_zip(file, length, wanted, limits);
+        return open_zip(file, length, (wanted, photos), limits);
     }
     let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
     if matches!(format, Format::Mat | Format::Hdf5) {
@@ -120,13 +133,19 @@ fn open_any(
         Format::Png => Box::new(png::PngReader::open(file, length, limits)?),
         Format::Tar => {
             let members = (format, tar::members(&file, length)?);
-            Box::new(Pictures::open(Arc::new(file), members, limits)?)
+            Box::new(Pictures::open(Arc::new(file), members, photos, limits)?)
+        }
+        Format::Jpeg | Format::Bmp | Format::Pnm if photos => {
+            Box::new(Photo::open(&read_picture(file, (format, length))?, format, limits)?)
+        }
+        Format::Jpeg | Format::Bmp | Format::Pnm => {
+            return Err(unknown(describe(&head(&mut file)?, name)));
         }
         Format::Exr => {
             let found = "it is an EXR file (to convert channel Y of each part: python -c \"import numpy, OpenEXR; f = \
                          OpenEXR.File('in.exr', separate_channels=True); numpy.save('out.npy', \
                          [part.channels['Y'].pixels for part in f.parts])\")";
-            return Err(FormatError::UnknownFormat { found: found.to_owned(), accepted: ACCEPTED });
+            return Err(unknown(found.to_owned()));
         }
         Format::Npy
         | Format::Zip
@@ -135,10 +154,7 @@ fn open_any(
         | Format::Hdf5
         | Format::Planar
         | Format::Raw => {
-            return Err(FormatError::UnknownFormat {
-                found: format!("it is a {format} file"),
-                accepted: ACCEPTED,
-            });
+            return Err(unknown(format!("it is a {format} file")));
         }
     };
     check_picture_axes(reader, &expected)
@@ -180,7 +196,7 @@ fn choose(
 fn open_zip(
     file: File,
     length: u64,
-    wanted: Option<Wanted<'_>>,
+    (wanted, photos): (Option<Wanted<'_>>, bool),
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
     let members = zip::members(&file, length)?;
@@ -199,7 +215,7 @@ fn open_zip(
         }
         Some(Wanted { name: Some(_), .. }) => Err(FormatError::NoNames),
         _ => {
-            let pictures = Pictures::open(Arc::new(file), (Format::Zip, members), limits)?;
+            let pictures = Pictures::open(Arc::new(file), (Format::Zip, members), photos, limits)?;
             let expected = wanted.map(|wanted| wanted.expected).unwrap_or_default();
             check_picture_axes(Box::new(pictures), &expected)
         }
@@ -249,29 +265,47 @@ pub fn collect(reader: &mut (dyn FrameReader + Send)) -> Result<(StackInfo, Arra
     Ok((info, stack))
 }
 
-/// Opens a file, and determines its length and format. `name` is the array that an error mentions.
-pub(super) fn open(path: &Path, name: &str) -> Result<(File, u64, Format)> {
-    let mut file = File::open(path).map_err(FormatError::io("open the file"))?;
-    let metadata = file.metadata().map_err(FormatError::io("read the file's length"))?;
-    let unknown = |found: String| FormatError::UnknownFormat { found, accepted: ACCEPTED };
-    if !metadata.is_file() {
+/// Opens a regular file. Opening a pipe would wait for its writer.
+///
+/// Errors: I/O; [`FormatError::UnknownFormat`] for folders, pipes and devices.
+pub fn open_file(path: &Path) -> Result<File> {
+    let kind = path.metadata().map_err(FormatError::io("open the file"))?.file_type();
+    if kind.is_dir() {
+        let found = "it is a folder; pack its pictures into a zip or tar archive";
+        return Err(unknown(found.to_owned()));
+    }
+    if !kind.is_file() {
         return Err(unknown("it is not a regular file".to_owned()));
     }
-    if metadata.len() == 0 {
+    File::open(path).map_err(FormatError::io("open the file"))
+}
+
+/// Opens a file, and determines its length and format. `name` is the array that an error mentions.
+pub(super) fn open(path: &Path, name: &str) -> Result<(File, u64, Format)> {
+    let mut file = open_file(path)?;
+    let length = file.metadata().map_err(FormatError::io("read the file's length"))?.len();
+    if length == 0 {
         return Err(unknown("it is empty".to_owned()));
     }
-    let mut head = Vec::new();
-    (&mut file)
-        .take(HEAD_BYTES)
-        .read_to_end(&mut head)
-        .map_err(FormatError::io("read the file"))?;
-    file.rewind().map_err(FormatError::io("read the file"))?;
+    let head = head(&mut file)?;
     let format = match Format::sniff(&head) {
         Some(format) => format,
-        None if has_user_block(&file, metadata.len())? => Format::Hdf5,
+        None if has_user_block(&file, length)? => Format::Hdf5,
         None => return Err(unknown(describe(&head, &hdf5::python_name(name)))),
     };
-    Ok((file, metadata.len(), format))
+    Ok((file, length, format))
+}
+
+/// The first bytes of a file.
+fn head(file: &mut File) -> Result<Vec<u8>> {
+    let mut head = Vec::new();
+    file.take(HEAD_BYTES).read_to_end(&mut head).map_err(FormatError::io("read the file"))?;
+    file.rewind().map_err(FormatError::io("read the file"))?;
+    Ok(head)
+}
+
+fn unknown(found: String) -> FormatError {
+    FormatError::UnknownFormat { found, accepted: ACCEPTED }
 }
 
 /// True if the file is HDF5 after a user block, which has 512 bytes or a larger power of 2.

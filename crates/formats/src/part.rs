@@ -3,11 +3,11 @@
 use std::io::Read;
 use std::str::FromStr;
 
-use ndarray::{Array2, s};
+use ndarray::s;
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, VariantNames};
 
-use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
+use super::{Format, FormatError, FrameReader, Frames, Limits, SampleType, StackInfo, samples};
 use crate::error::Result;
 
 type Reader = Box<dyn FrameReader + Send>;
@@ -54,19 +54,8 @@ pub struct Part {
 }
 
 /// An order of bits in which 12-bit cameras pack two pixels into three bytes.
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    Serialize,
-    Deserialize,
-    Display,
-    EnumString,
-    VariantNames,
-    schemars::JsonSchema,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, Display, EnumString, VariantNames, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
 pub enum Packing {
@@ -85,7 +74,7 @@ impl Part {
     /// Limits a stack to this part.
     ///
     /// Errors: [`FormatError::Part`] for a part outside the stack.
-    pub(super) fn of(&self, reader: Reader) -> Result<Reader> {
+    pub(super) fn of(&self, mut reader: Reader) -> Result<Reader> {
         if *self == Self::default() {
             return Ok(reader);
         }
@@ -114,36 +103,19 @@ impl Part {
         }
         let info =
             StackInfo { frames: last - first + 1, height: crop.height, width: crop.width, ..all };
-        Ok(Box::new(PartReader { reader, info, crop, skip: first, remaining: info.frames }))
-    }
-}
-
-/// Reads a part of a stack.
-struct PartReader {
-    reader: Reader,
-    info: StackInfo,
-    crop: Crop,
-    /// Number of frames before the part that have not been skipped yet.
-    skip: usize,
-    remaining: usize,
-}
-
-impl FrameReader for PartReader {
-    fn info(&self) -> &StackInfo {
-        &self.info
-    }
-
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        if self.remaining == 0 {
-            return Ok(None);
-        }
-        for _ in 0..std::mem::take(&mut self.skip) {
-            self.reader.next_frame()?;
-        }
-        self.remaining -= 1;
-        let Crop { row, column, height, width } = self.crop;
+        let (mut skip, mut remaining) = (first, info.frames);
+        let Crop { row, column, height, width } = crop;
         let window = s![row..row + height, column..column + width];
-        Ok(self.reader.next_frame()?.map(|frame| frame.slice(window).to_owned()))
+        Ok(Box::new(Frames::new(info, move || {
+            if remaining == 0 {
+                return Ok(None);
+            }
+            for _ in 0..std::mem::take(&mut skip) {
+                reader.next_frame()?;
+            }
+            remaining -= 1;
+            Ok(reader.next_frame()?.map(|frame| frame.slice(window).to_owned()))
+        })))
     }
 }
 
@@ -175,7 +147,7 @@ impl Packing {
     /// Unpacks the rows of a stack of bytes.
     ///
     /// Errors: [`FormatError::Part`] for stacks of other samples, or rows of other than whole pairs of pixels.
-    pub(super) fn rows_of(self, reader: Reader) -> Result<Reader> {
+    pub(super) fn rows_of(self, mut reader: Reader) -> Result<Reader> {
         let stored = *reader.info();
         if stored.sample != SampleType::U8 || !stored.width.is_multiple_of(PAIR_BYTES) {
             let detail = format!(
@@ -187,7 +159,13 @@ impl Packing {
         }
         let (sample, width) = (SampleType::U16, stored.width / PAIR_BYTES * 2);
         let info = StackInfo { sample, width, ..stored }.with_largest(LARGEST)?;
-        Ok(Box::new(Unpacked { reader, info, packing: self }))
+        Ok(Box::new(Frames::new(info, move || {
+            let Some(frame) = reader.next_frame()? else { return Ok(None) };
+            // Rows are whole pairs, so pairs do not cross rows.
+            let bytes: Vec<u8> = frame.iter().map(|value| *value as u8).collect();
+            let pixels = self.unpack(&bytes, info.height * info.width);
+            samples::frame(info.height, info.width, pixels).map(Some)
+        })))
     }
 
     /// Reads a file without a header as frames of a known size.
@@ -195,7 +173,7 @@ impl Packing {
     /// Errors: [`FormatError::Part`] for an unknown size, or a length that is not a multiple of a frame.
     pub(super) fn raw<R: Read + Send + 'static>(
         self,
-        file: R,
+        mut file: R,
         length: u64,
         size: Option<(usize, usize)>,
         limits: &Limits,
@@ -219,55 +197,17 @@ impl Packing {
         limits.check_shape(Format::Raw, frames, height as u64, width as u64)?;
         let frames = usize::try_from(frames).unwrap_or(usize::MAX);
         let info = StackInfo::new(Format::Raw, SampleType::U16, frames, height, width);
-        Ok(Box::new(Raw { file, info: info.with_largest(LARGEST)?, packing: self, next: 0 }))
-    }
-}
-
-/// Unpacks rows of packed pixels.
-struct Unpacked {
-    reader: Reader,
-    info: StackInfo,
-    packing: Packing,
-}
-
-impl FrameReader for Unpacked {
-    fn info(&self) -> &StackInfo {
-        &self.info
-    }
-
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        let Some(frame) = self.reader.next_frame()? else { return Ok(None) };
-        let StackInfo { height, width, .. } = self.info;
-        // Rows are whole pairs, so pairs do not cross rows.
-        let bytes: Vec<u8> = frame.iter().map(|value| *value as u8).collect();
-        let pixels = self.packing.unpack(&bytes, height * width);
-        samples::frame(height, width, pixels).map(Some)
-    }
-}
-
-/// Reads packed pixels of a file without a header.
-struct Raw<R> {
-    file: R,
-    info: StackInfo,
-    packing: Packing,
-    next: usize,
-}
-
-impl<R: Read> FrameReader for Raw<R> {
-    fn info(&self) -> &StackInfo {
-        &self.info
-    }
-
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        let StackInfo { frames, height, width, .. } = self.info;
-        if self.next == frames {
-            return Ok(None);
-        }
-        self.next += 1;
-        let mut bytes = vec![0; self.packing.bytes(height * width)];
-        let read = self.file.read_exact(&mut bytes);
-        read.map_err(|error| samples::read_error(Format::Raw, error))?;
-        samples::frame(height, width, self.packing.unpack(&bytes, height * width)).map(Some)
+        let (info, mut remaining) = (info.with_largest(LARGEST)?, frames);
+        Ok(Box::new(Frames::new(info, move || {
+            if remaining == 0 {
+                return Ok(None);
+            }
+            remaining -= 1;
+            let mut bytes = vec![0; self.bytes(height * width)];
+            let read = file.read_exact(&mut bytes);
+            read.map_err(|error| samples::read_error(Format::Raw, error))?;
+            samples::frame(height, width, self.unpack(&bytes, height * width)).map(Some)
+        })))
     }
 }
 

@@ -1,21 +1,18 @@
-//! ZIP and tar archives of numbered pictures. Each picture, a PNG or a TIFF of one page, is a frame.
+//! ZIP and tar archives of numbered pictures. Each picture, a PNG or a TIFF of one page, is a frame. True frames may be
+//! JPEG, BMP or PNM.
 
 use std::fs::File;
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::sync::Arc;
 
 use ndarray::Array2;
 
 use super::member::{Member, MemberReader, quoted};
+use super::photo::{Photo, read_picture};
 use super::png::PngReader;
-use super::samples::read_error;
 use super::tiff;
 use super::{Format, FormatError, FrameReader, Limits, StackInfo};
 use crate::error::Result;
-
-/// Largest size of a picture, which is read into memory as a whole: a frame of the largest sides in 16 bits, with a
-/// margin.
-const MAX_PICTURE_BYTES: u64 = 160 << 20;
 
 /// Reads the pictures of an archive as frames.
 pub(super) struct Pictures {
@@ -23,6 +20,8 @@ pub(super) struct Pictures {
     /// The pictures in the order of their numbers.
     members: Vec<Member>,
     info: StackInfo,
+    /// True if JPEG, BMP and PNM are accepted.
+    photos: bool,
     limits: Limits,
     next: usize,
 }
@@ -32,14 +31,15 @@ impl Pictures {
     pub(super) fn open(
         archive: Arc<File>,
         (format, members): (Format, Vec<Member>),
+        photos: bool,
         limits: &Limits,
     ) -> Result<Self> {
         let members = in_order(format, members)?;
         let first = &members[0];
-        let info = *picture(&archive, (format, first), limits)?.info();
+        let info = *picture(&archive, (format, first), photos, limits)?.info();
         let info = StackInfo { frames: members.len(), format, ..info };
         limits.check_info(&info)?;
-        Ok(Self { archive, members, info, limits: *limits, next: 0 })
+        Ok(Self { archive, members, info, photos, limits: *limits, next: 0 })
     }
 }
 
@@ -51,7 +51,8 @@ impl FrameReader for Pictures {
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
         let Some(member) = self.members.get(self.next) else { return Ok(None) };
         self.next += 1;
-        let mut reader = picture(&self.archive, (self.info.format, member), &self.limits)?;
+        let member_of = (self.info.format, member);
+        let mut reader = picture(&self.archive, member_of, self.photos, &self.limits)?;
         let (info, first) = (*reader.info(), self.info);
         if (info.height, info.width, info.sample) != (first.height, first.width, first.sample) {
             let problem = format!(
@@ -75,24 +76,20 @@ impl FrameReader for Pictures {
 fn picture(
     archive: &Arc<File>,
     (format, member): (Format, &Member),
+    photos: bool,
     limits: &Limits,
 ) -> Result<Box<dyn FrameReader + Send>> {
-    if member.size > MAX_PICTURE_BYTES {
-        return Err(FormatError::OverLimit {
-            format,
-            what: "the length of a picture in bytes",
-            value: member.size,
-            limit: MAX_PICTURE_BYTES,
-        });
-    }
-    let mut bytes = Vec::new();
-    let read = MemberReader::new(Arc::clone(archive), member.clone()).read_to_end(&mut bytes);
-    read.map_err(|error| in_member(&member.name)(read_error(format, error)))?;
+    let content = MemberReader::new(Arc::clone(archive), member.clone());
+    let bytes = read_picture(content, (format, member.size)).map_err(in_member(&member.name))?;
     let length = bytes.len() as u64;
     let reader: Result<Box<dyn FrameReader + Send>> = match Format::sniff(&bytes) {
         Some(Format::Png) => PngReader::open(Cursor::new(bytes), length, limits)
             .map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>),
         Some(Format::Tiff) => tiff::open(Cursor::new(bytes), length, limits),
+        Some(kind @ (Format::Jpeg | Format::Bmp | Format::Pnm)) if photos => {
+            Photo::open(&bytes, kind, limits)
+                .map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
+        }
         _ => Err(unsupported(
             format,
             format!("{}, which is neither PNG nor TIFF", quoted(&member.name)),

@@ -6,15 +6,12 @@
 
 use std::fs::File;
 use std::io::Write;
-use std::ops::Range;
 use std::os::unix::fs::FileExt;
 use std::path::Path;
 
-use ndarray::Array3;
-
 use super::format::PLANAR_MAGIC;
 use super::samples::StackWriter;
-use super::{Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
+use super::{Format, FormatError, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
 const VERSION: u32 = 1;
@@ -48,11 +45,8 @@ pub fn bytes(info: &StackInfo) -> u64 {
     HEADER_BYTES + info.voxels() * SAMPLE_BYTES
 }
 
-/// An open prepared array. Reads are positional, so threads can share it.
-#[derive(Debug)]
-pub struct Reader {
-    windows: WindowReader,
-}
+/// An open prepared array.
+pub use super::WindowReader as Reader;
 
 impl Reader {
     /// Opens a prepared array, and checks its header against the limits and the length of the file.
@@ -89,51 +83,8 @@ impl Reader {
                 format!("{} bytes follow the {shape}", length - promised),
             ));
         }
-        Ok(Self { windows: WindowReader::new(file, info, HEADER_BYTES) })
+        Ok(Self::new(file, info, HEADER_BYTES))
     }
-
-    /// The description of the array. Samples are always float32.
-    pub fn info(&self) -> &StackInfo {
-        self.windows.info()
-    }
-
-    /// The underlying reader of windows, which is common to several formats.
-    pub fn into_windows(self) -> WindowReader {
-        self.windows
-    }
-
-    /// Reads a window (frame, row, column).
-    ///
-    /// Errors: I/O; [`FormatError::Internal`] for a window outside the stack.
-    pub fn read_window(
-        &self,
-        frames: Range<usize>,
-        rows: Range<usize>,
-        columns: Range<usize>,
-    ) -> Result<Array3<f32>> {
-        self.windows.read_window(frames, rows, columns)
-    }
-
-    /// Reads every `step`th row and column of a window; see [`WindowReader::read_lattice`].
-    pub fn read_lattice(
-        &self,
-        frames: Range<usize>,
-        place: (Range<usize>, Range<usize>),
-        step: usize,
-    ) -> Result<Array3<f32>> {
-        self.windows.read_lattice(frames, place, step)
-    }
-}
-
-/// Opens a prepared array, and reads one window; see [`Reader::read_window`].
-pub fn read_window(
-    path: &Path,
-    frames: Range<usize>,
-    rows: Range<usize>,
-    columns: Range<usize>,
-    limits: &Limits,
-) -> Result<Array3<f32>> {
-    Reader::open(path, limits)?.read_window(frames, rows, columns)
 }
 
 fn parse_header(header: &[u8; HEADER_BYTES as usize]) -> Result<StackInfo> {

@@ -1,14 +1,11 @@
-//! PNG: reads one frame, and writes frames of 8 or 16 bits.
+//! Reads PNG with all bits, as a stack of one frame.
 
-use std::fs::File;
-use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, Write};
-use std::path::Path;
+use std::io::{BufReader, ErrorKind, Read, Seek};
 
 use ::png::{
-    BitDepth, ColorType, Compression, Decoder, DecodingError, Encoder, EncodingError,
-    Limits as DecoderLimits, Transformations,
+    BitDepth, ColorType, Decoder, DecodingError, Limits as DecoderLimits, Transformations,
 };
-use ndarray::{Array2, ArrayView2};
+use ndarray::Array2;
 
 use super::samples::{self, ByteOrder};
 use super::{Channels, Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
@@ -126,83 +123,6 @@ fn row_bytes(info: &StackInfo) -> usize {
     }
 }
 
-/// Writes a 16-bit PNG for display, and replaces an existing file. Values are mapped linearly from \[black, white\] to
-/// \[0, 65535\] and clipped; NaN becomes 0. `frame` has the axes (row, column), with all channels of a pixel in
-/// adjacent columns.
-///
-/// Errors: I/O; [`FormatError::Internal`] unless `black < white`, both finite.
-pub fn write_u16(
-    path: &Path,
-    frame: ArrayView2<'_, f32>,
-    channels: Channels,
-    black: f32,
-    white: f32,
-) -> Result<()> {
-    let file = File::create(path).map_err(FormatError::io("create the PNG"))?;
-    encode_u16(BufWriter::new(file), frame, channels, (black, white))
-}
-
-/// Encodes an 8-bit PNG for display. Values are mapped linearly from \[black, white\] to \[0, 255\] and clipped; NaN
-/// becomes 0. `frame` has the axes (row, column), with all channels of a pixel in adjacent columns.
-///
-/// Errors: [`FormatError::Internal`] unless `black < white`, both finite, and for a frame without pixels.
-pub fn encode_u8(
-    frame: ArrayView2<'_, f32>,
-    channels: Channels,
-    black: f32,
-    white: f32,
-) -> Result<Vec<u8>> {
-    let bytes: Vec<u8> = frame.iter().map(level_u8(black, white)).collect();
-    let mut png = Vec::new();
-    encode(&mut png, frame.dim(), (channels, BitDepth::Eight), (black, white), &bytes)?;
-    Ok(png)
-}
-
-/// The mapping of values to 8-bit levels that [`encode_u8`] uses.
-pub fn level_u8(black: f32, white: f32) -> impl Fn(&f32) -> u8 {
-    let factor = 255.0 / (white - black);
-    move |value| ((value - black) * factor).round() as u8
-}
-
-fn encode_u16(
-    writer: impl Write,
-    frame: ArrayView2<'_, f32>,
-    channels: Channels,
-    (black, white): (f32, f32),
-) -> Result<()> {
-    let factor = 65535.0 / (white - black);
-    let bytes: Vec<u8> =
-        frame.iter().flat_map(|v| (((v - black) * factor).round() as u16).to_be_bytes()).collect();
-    encode(writer, frame.dim(), (channels, BitDepth::Sixteen), (black, white), &bytes)
-}
-
-fn encode(
-    writer: impl Write,
-    (height, samples): (usize, usize),
-    (channels, depth): (Channels, BitDepth),
-    (black, white): (f32, f32),
-    bytes: &[u8],
-) -> Result<()> {
-    if !(black.is_finite() && white.is_finite() && black < white) {
-        return Err(FormatError::Internal(format!(
-            "a PNG has black {black} and white {white}; black must be below white"
-        )));
-    }
-    let width = samples / channels.count();
-    let [height, width] = [height, width].map(|n| u32::try_from(n).unwrap_or(0));
-    let mut encoder = Encoder::new(writer, width, height);
-    encoder.set_color(match channels {
-        Channels::Grey => ColorType::Grayscale,
-        Channels::Rgb => ColorType::Rgb,
-    });
-    encoder.set_depth(depth);
-    // Higher levels gain little, because the low bits are noise.
-    encoder.set_compression(Compression::Fast);
-    let mut png = encoder.write_header().map_err(encoding_error)?;
-    png.write_image_data(bytes).map_err(encoding_error)?;
-    png.finish().map_err(encoding_error)
-}
-
 fn unsupported(found: String) -> FormatError {
     FormatError::Unsupported {
         format: Format::Png,
@@ -225,13 +145,6 @@ fn decoding_error(error: DecodingError) -> FormatError {
         }
         DecodingError::IoError(source) => FormatError::Io { action: "read the PNG", source },
         other => FormatError::malformed(Format::Png, other.to_string()),
-    }
-}
-
-fn encoding_error(error: EncodingError) -> FormatError {
-    match error {
-        EncodingError::IoError(source) => FormatError::Io { action: "write the PNG", source },
-        other => FormatError::Internal(format!("PNG: {other}")),
     }
 }
 

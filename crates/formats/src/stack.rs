@@ -169,6 +169,29 @@ pub trait FrameReader {
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>>;
 }
 
+/// A stack of frames that a function returns one at a time.
+pub struct Frames<F> {
+    info: StackInfo,
+    next: F,
+}
+
+impl<F: FnMut() -> Result<Option<Array2<f32>>>> Frames<F> {
+    /// A stack of this description. `next` returns the next frame, and `None` after the last one.
+    pub fn new(info: StackInfo, next: F) -> Self {
+        Self { info, next }
+    }
+}
+
+impl<F: FnMut() -> Result<Option<Array2<f32>>>> FrameReader for Frames<F> {
+    fn info(&self) -> &StackInfo {
+        &self.info
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
+        (self.next)()
+    }
+}
+
 impl<R: FrameReader + ?Sized> FrameReader for Box<R> {
     fn info(&self) -> &StackInfo {
         (**self).info()

@@ -20,7 +20,7 @@ const MAX_MEMBERS: usize = 16_384;
 const MAX_NAME_BYTES: u64 = 1 << 16;
 
 /// Returns all members that are regular files. Errors: a damaged header; members outside the file, or of one
-/// name; sparse files.
+/// name; links, devices and sparse files.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     let (mut offset, mut members, mut count) = (0, Vec::new(), 0);
     let mut long_name = None;
@@ -44,22 +44,29 @@ pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
             0 | b'0' | b'7' => members.push(member),
             b'L' => long_name = Some(text(&read_metadata(file, &member)?)),
             b'x' => long_name = extended_name(&read_metadata(file, &member)?)?,
-            // Folders, links, and metadata of the whole archive.
-            b'1'..=b'6' | b'g' | b'K' => {}
-            other => {
-                return Err(FormatError::Unsupported {
-                    format: Format::Tar,
-                    found: format!(
-                        "{} of the kind '{}'",
-                        quoted(&member.name),
-                        other.escape_ascii()
-                    ),
-                    accepted: "regular files",
-                });
-            }
+            // Folders, and metadata of other members.
+            b'5' | b'g' | b'K' => {}
+            kind => return Err(no_file(&member.name, kind)),
         }
     }
     distinct(members, Format::Tar)
+}
+
+/// The error for a member that has no content. Left out in silence, it could be a frame that is missing.
+fn no_file(name: &str, kind: u8) -> FormatError {
+    let kind = match kind {
+        b'1' | b'2' => {
+            "a link, which has no content; pack it with tar --hard-dereference --dereference"
+                .to_owned()
+        }
+        b'3' | b'4' | b'6' => "a device or a pipe".to_owned(),
+        _ => format!("of the kind '{}'", kind.escape_ascii()),
+    };
+    FormatError::Unsupported {
+        format: Format::Tar,
+        found: format!("{}, {kind}", quoted(name)),
+        accepted: "regular files",
+    }
 }
 
 /// The name in a header, including folders.

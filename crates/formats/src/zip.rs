@@ -7,7 +7,7 @@ use std::fs::File;
 use std::os::unix::fs::FileExt;
 
 use super::member::{Member, Packing, distinct, quoted};
-use super::{Format, FormatError};
+use super::{Format, FormatError, limits};
 use crate::error::Result;
 
 /// Signatures and lengths of the records of a ZIP archive.
@@ -38,14 +38,8 @@ struct Directory {
 /// by another method than Deflate; members outside the file, longer than Deflate can expand, or of one name.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     let directory = directory(file, length)?;
-    if directory.bytes > MAX_DIRECTORY_BYTES {
-        return Err(FormatError::OverLimit {
-            format: Format::Zip,
-            what: "the length of the directory in bytes",
-            value: directory.bytes,
-            limit: MAX_DIRECTORY_BYTES,
-        });
-    }
+    let what = "the length of the directory in bytes";
+    limits::check(Format::Zip, what, directory.bytes, MAX_DIRECTORY_BYTES)?;
     let bytes = read(file, length, directory.start, directory.bytes)?;
     let mut rest = &*bytes;
     let mut members = Vec::new();

@@ -7,21 +7,23 @@ use super::{
     Reordering, flatness, pattern_overlap, reordering,
 };
 use ndarray::ArrayView3;
+use serde::{Deserialize, Serialize};
 
 /// Statistics of the captures of one pattern.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[schemars(rename = "PatternReport")]
 pub struct PatternFigures {
-    /// Mean of the mask before normalisation to the largest value, as a share of the white image.
-    pub mean: f64,
-    /// Share of the pixels that are at or below 0.
+    /// Mean share of the light of the white image.
+    pub light: f64,
+    /// Share of the pixels at or below 0.
     pub not_positive: f64,
-    /// Share of the pixels that are below 0 by more than noise explains.
+    /// Share of the pixels below 0 by more than noise explains.
     pub negative: f64,
     /// Standard deviation of a mask value due to noise; `None` without repeats.
     pub noise: Option<f64>,
     /// Share of saturated pixels; `None` if the saturation level is unknown.
     pub saturated: Option<f64>,
-    /// Largest relative change of the mean brightness during the repeats.
+    /// Relative change of the light during the repeats.
     pub drift: f64,
 }
 
@@ -30,7 +32,7 @@ impl PatternFigures {
     pub fn new(mask: &RawMask, saturated: Option<u64>, drift: f64) -> Self {
         let pixels = mask.values.len().max(1) as f64;
         Self {
-            mean: mask.mean,
+            light: mask.mean,
             not_positive: mask.not_positive as f64 / pixels,
             negative: mask.negative as f64 / pixels,
             noise: mask.noise,
@@ -40,25 +42,25 @@ impl PatternFigures {
     }
 }
 
-/// Statistics of all captures of a calibration.
-#[derive(Debug, Clone, PartialEq)]
+/// Statistics of all captures of a calibration. Levels are stored values.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct CaptureFigures {
-    /// Statistics of each pattern, in order.
-    pub patterns: Vec<PatternFigures>,
+    /// Mean of the white image.
+    pub white_level: f64,
+    /// Mean of the black image.
+    pub black_level: f64,
+    /// Mean of the black image with the lithography mask in place; `None` if Eq. 7 was used.
+    pub black_with_mask_level: Option<f64>,
+    /// Illumination of the darkest part over that of the brightest.
+    pub illumination_flatness: Option<f64>,
+    /// Share of saturated pixels of the white image; `None` if the saturation level is unknown.
+    pub white_saturated: Option<f64>,
     /// Share of the pixels whose white is not above their black.
     pub denominator_not_positive: f64,
     /// Share of the pixels whose white is above their black, but by too little to divide by.
     pub denominator_too_dark: f64,
-    /// Share of the pixels of the white image that are saturated; `None` if the saturation level is unknown.
-    pub white_saturated: Option<f64>,
-    /// Mean stored value of the white image.
-    pub white_level: f64,
-    /// Mean stored value of the black image.
-    pub black_level: f64,
-    /// Mean stored value of the black image with the lithography mask in place, if there is one.
-    pub black_with_mask_level: Option<f64>,
-    /// Illumination of the darkest part over that of the brightest; see [`flatness`].
-    pub flatness: Option<f64>,
+    /// Statistics of each pattern, in order.
+    pub patterns: Vec<PatternFigures>,
 }
 
 impl CaptureFigures {
@@ -77,7 +79,7 @@ impl CaptureFigures {
             white_level: mean(&references.white),
             black_level: mean(&references.black),
             black_with_mask_level: references.black_with_mask.as_ref().map(mean),
-            flatness: flatness(&calibrator.illumination()),
+            illumination_flatness: flatness(&calibrator.illumination()),
         }
     }
 
@@ -282,7 +284,7 @@ pub fn judge_captures(figures: &CaptureFigures) -> Vec<Finding> {
         findings.push(Finding::new(FindingCode::DarkIllumination, detail).escalate_if(lost > 0.05));
     }
     findings.extend(wrong_dark(figures));
-    if let Some(flatness) = figures.flatness.filter(|flatness| *flatness < 0.5) {
+    if let Some(flatness) = figures.illumination_flatness.filter(|flatness| *flatness < 0.5) {
         findings.push(Finding::new(
             FindingCode::UnevenIllumination,
             format!(
@@ -292,7 +294,7 @@ pub fn judge_captures(figures: &CaptureFigures) -> Vec<Finding> {
         ));
     }
     let noise: Vec<f64> = figures.patterns.iter().filter_map(|pattern| pattern.noise).collect();
-    let mean = figures.patterns.iter().map(|pattern| pattern.mean).sum::<f64>()
+    let mean = figures.patterns.iter().map(|pattern| pattern.light).sum::<f64>()
         / figures.patterns.len().max(1) as f64;
     let mean_noise = noise.iter().sum::<f64>() / noise.len().max(1) as f64;
     if noise.is_empty() {

@@ -5,7 +5,7 @@ use rand::Rng;
 use rand_distr::{Distribution, Normal, Poisson};
 use serde::{Deserialize, Serialize};
 
-use super::{OpticsError, Result};
+use super::{OpticsError, Result, check_parameter};
 
 /// A camera and its exposure. Signals are shares of the full well.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -48,32 +48,24 @@ impl Camera {
     ///
     /// Errors: [`OpticsError::Parameter`] that names the first one out of range.
     pub fn check(&self) -> Result<()> {
-        let refused = |name, value: f64, range| {
-            Err(OpticsError::Parameter { name, value: value.to_string(), range })
-        };
-        if !(1..=16).contains(&self.bits) {
-            return refused("camera bits", self.bits.into(), "1 to 16");
-        }
-        if !(1.0..=1e9).contains(&self.full_well_e) {
-            return refused("camera full_well_e", self.full_well_e, "1 to 1e9 electrons");
-        }
-        if !(0.0..=self.full_well_e).contains(&self.read_noise_e) {
-            return refused("camera read_noise_e", self.read_noise_e, "0 to the full well");
-        }
+        let (well, noise) = (self.full_well_e, self.read_noise_e);
+        check_parameter((1..=16).contains(&self.bits), "camera bits", self.bits, "1 to 16")?;
+        let range = "1 to 1e9 electrons";
+        check_parameter((1.0..=1e9).contains(&well), "camera full_well_e", well, range)?;
+        let range = "0 to the full well";
+        check_parameter((0.0..=well).contains(&noise), "camera read_noise_e", noise, range)?;
         for (name, value) in
             [("camera black_level", self.black_level), ("camera background", self.background)]
         {
-            if !(0.0..1.0).contains(&value) {
-                return refused(name, value, "at least 0 and below 1, a share of the full well");
-            }
+            let range = "at least 0 and below 1, a share of the full well";
+            check_parameter((0.0..1.0).contains(&value), name, value, range)?;
         }
         for (name, value) in [
             ("camera calibration_exposure", self.calibration_exposure),
             ("camera measurement_exposure", self.measurement_exposure),
         ] {
-            if !(value > 0.0 && value <= 100.0) {
-                return refused(name, value, "above 0 and at most 100 full wells");
-            }
+            let range = "above 0 and at most 100 full wells";
+            check_parameter(value > 0.0 && value <= 100.0, name, value, range)?;
         }
         Ok(())
     }
@@ -129,13 +121,8 @@ fn impossible(error: &dyn std::fmt::Display) -> OpticsError {
 ///
 /// Errors: [`OpticsError::Parameter`] for a share outside \[0,1).
 pub fn illumination((height, width): (usize, usize), vignetting: f64) -> Result<Array2<f32>> {
-    if !(0.0..1.0).contains(&vignetting) {
-        return Err(OpticsError::Parameter {
-            name: "light vignetting",
-            value: vignetting.to_string(),
-            range: "at least 0 and below 1, the share of light lost at the corners",
-        });
-    }
+    let range = "at least 0 and below 1, the share of light lost at the corners";
+    check_parameter((0.0..1.0).contains(&vignetting), "light vignetting", vignetting, range)?;
     let (middle_row, middle_column) = ((height as f64 - 1.0) / 2.0, (width as f64 - 1.0) / 2.0);
     let corner = (middle_row.powi(2) + middle_column.powi(2)).max(f64::MIN_POSITIVE);
     #[allow(clippy::cast_possible_truncation)] // to the precision of pictures

@@ -37,12 +37,10 @@ pub struct Dispersion {
 }
 
 /// The axis of a dispersion.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Display, EnumString, VariantNames,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, Display, EnumString, VariantNames, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
-#[derive(schemars::JsonSchema)]
 pub enum DispersionAxis {
     /// Bands are displaced to the right, so the measurement is wider than a band.
     Column,
@@ -51,22 +49,10 @@ pub enum DispersionAxis {
 }
 
 /// The area that the mask of a spectral camera covers.
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    Default,
-    Serialize,
-    Deserialize,
-    Display,
-    EnumString,
-    VariantNames,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Serialize, Deserialize, Display, EnumString, VariantNames, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
-#[derive(schemars::JsonSchema)]
 pub enum MaskExtent {
     /// The scene: the mask has the size of a band, and the measurement is longer by the largest offset.
     #[default]

@@ -33,58 +33,6 @@ pub enum Subject {
     Job,
 }
 
-/// The stable identifier of a finding. Codes are part of the API and never change.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Hash, Display, EnumString, IntoStaticStr, VariantArray,
-)]
-#[strum(serialize_all = "snake_case")]
-#[allow(missing_docs)] // `entry` describes each code
-pub enum FindingCode {
-    DeadPixels,
-    StuckPixels,
-    OneDimensional,
-    MissingPattern,
-    UnevenPatterns,
-    RepeatedPattern,
-    SwappedOrder,
-    Correlated,
-    MaskScale,
-    WeakModulation,
-    Pedestal,
-    SaturatedWhite,
-    SaturatedPatterns,
-    DarkIllumination,
-    UnevenIllumination,
-    NoRepeats,
-    NoisyMasks,
-    LightDrift,
-    BadCalibration,
-    Saturated,
-    BadPixels,
-    EmptySnapshot,
-    BinaryMeasurement,
-    LeftAligned,
-    RightAligned,
-    Level,
-    NoDark,
-    WrongDark,
-    Negative,
-    NegativeOffset,
-    Mosaic,
-    ShiftedMasks,
-    DriftedMasks,
-    MovedMasks,
-    TurnedMasks,
-    ForeignMasks,
-    InvertedMasks,
-    FastMotion,
-    UnfamiliarMasks,
-    UnevenError,
-    NoTileWorkers,
-    UnexplainedPixels,
-    ExchangedMasks,
-}
-
 /// The description of a [`FindingCode`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Entry {
@@ -100,329 +48,187 @@ pub struct Entry {
     pub remedy: &'static str,
 }
 
+/// Declares [`FindingCode`] from a table of codes, subjects, severities, titles and remedies.
+macro_rules! findings {
+    ($($code:ident: $subjects:expr, $severities:expr, $title:expr, $remedy:expr;)+) => {
+        /// The stable identifier of a finding. Codes are part of the API and never change.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        #[derive(Display, EnumString, IntoStaticStr, VariantArray)]
+        #[strum(serialize_all = "snake_case")]
+        #[allow(missing_docs)] // `entry` describes each code
+        pub enum FindingCode {
+            $($code,)+
+        }
+
+        impl FindingCode {
+            /// The description of this code.
+            pub const fn entry(self) -> Entry {
+                use Severity::{Error, Warning};
+                use Subject::{Calibration, Job, Measurement, Result};
+                let (subjects, severities, title, remedy): (&[Subject], &[Severity], _, _) =
+                    match self {
+                        $(Self::$code => (&$subjects, &$severities, $title, $remedy),)+
+                    };
+                let (severity, worst) = (severities[0], severities[severities.len() - 1]);
+                Entry { subjects, severity, worst, title, remedy }
+            }
+        }
+    };
+}
+
+const REPEAT_PATTERNS: &str = "check the LCoS pattern sequence and its trigger, then record again";
+const REDUCE_EXPOSURE: &str =
+    "reduce the exposure of the whole calibration and record all captures again";
+
+// Each code has the subjects, the usual severity with that of grave cases, the title and the remedy.
+findings! {
+    DeadPixels: [Calibration], [Warning, Error],
+        "pixels are dark in every mask",
+        "look at the Gram map of the report: dust or a displaced mask darkens whole areas, too few repeats darken \
+         single pixels";
+    StuckPixels: [Calibration], [Warning],
+        "pixels are open in every mask",
+        "check the sensor for hot pixels and the captures for saturation";
+    OneDimensional: [Calibration], [Warning],
+        "the masks vary along one axis only",
+        "check that the file has the axes [frame, row, column], and that the lithography mask is in place";
+    MissingPattern: [Calibration, Measurement], [Error],
+        "a pattern was not shown",
+        REPEAT_PATTERNS;
+    UnevenPatterns: [Calibration], [Warning],
+        "a pattern is more than 30 % brighter or darker than the median",
+        REPEAT_PATTERNS;
+    RepeatedPattern: [Calibration], [Error],
+        "two masks show the same pattern",
+        REPEAT_PATTERNS;
+    SwappedOrder: [Calibration], [Error],
+        "the masks are not in the order of the patterns",
+        "list the captures in the order in which the LCoS shows the patterns during a measurement";
+    Correlated: [Calibration], [Warning],
+        "the masks are highly correlated",
+        "use patterns that overlap less, more sub-apertures, or a sharper projection (check the mask distance and \
+         aberrations)";
+    MaskScale: [Calibration, Measurement], [Warning],
+        "the largest mask value is far below the full scale",
+        "state the `full_scale` of the masks, not of the measurement: the stored number that means fully open, for \
+         example 15 for 4-bit values, 4095 for 12-bit values stored in 16 bits";
+    WeakModulation: [Calibration], [Warning],
+        "the masks hardly differ from frame to frame",
+        "focus the projection of the lithography mask, and check that the LCoS pattern changes";
+    Pedestal: [Calibration], [Warning],
+        "closed mask pixels let light through",
+        "record `black_with_mask` again with the LCoS running and all black, so that it contains the leakage";
+    SaturatedWhite: [Calibration], [Warning, Error],
+        "pixels of the white image are saturated",
+        REDUCE_EXPOSURE;
+    SaturatedPatterns: [Calibration], [Error],
+        "pixels of a pattern are saturated",
+        REDUCE_EXPOSURE;
+    DarkIllumination: [Calibration], [Warning, Error],
+        "the white image is hardly brighter than the black one",
+        "illuminate the white board up to the corners, and check that white and black are not interchanged";
+    UnevenIllumination: [Calibration], [Warning],
+        "the illumination is uneven",
+        "illuminate the white board evenly, and check the aperture for vignetting";
+    NoRepeats: [Calibration], [Warning],
+        "captures have no repeats, so the noise is unknown",
+        "record each capture several times; the paper uses 50 repeats";
+    NoisyMasks: [Calibration], [Warning],
+        "the masks are noisy",
+        "record more repeats or increase the exposure";
+    LightDrift: [Calibration], [Warning],
+        "the light changed during the repeats",
+        "let the lamp and the LCoS warm up, and fix exposure and gain";
+    BadCalibration: [Measurement], [Error],
+        "the calibration is graded `bad`",
+        "read the calibration's report, correct the problems it lists, and calibrate again";
+    Saturated: [Measurement], [Warning, Error],
+        "pixels are saturated",
+        "reduce the exposure time or stop down the lens; if the value is a valid reading, state a higher `saturation`";
+    BadPixels: [Measurement], [Warning, Error],
+        "pixels are hot, dead, or marked as not measured",
+        "if there are few, do nothing; otherwise name a map of the sensor's bad pixels as `bad_pixels` of the calibration";
+    EmptySnapshot: [Measurement], [Warning],
+        "a snapshot is 0 everywhere, or has no finite value",
+        "check the trigger of the camera; the frames of this snapshot are black";
+    BinaryMeasurement: [Measurement], [Error],
+        "a snapshot has only two values, as masks have, or is a copy of a mask",
+        "send the snapshots of the camera as the measurement, and the masks to the calibration";
+    LeftAligned: [Measurement], [Warning],
+        "12-bit values are left-aligned in 16 bits",
+        "state 65520 as `saturation`; the `full_scale` is the number that one frame adds, at most 65520";
+    RightAligned: [Measurement], [Warning],
+        "12-bit values are right-aligned in 16 bits",
+        "if the camera has 12 bits, state 4095 as `saturation`; the `full_scale` is the number that one frame adds, \
+         at most 4095";
+    Level: [Measurement, Result], [Warning],
+        "the brightest parts of the scene are implausible, for example below 0.12 or above 1.1 of the full scale",
+        "state the `full_scale` of the measurement for its exposure and bit depth";
+    NoDark: [Measurement], [Warning, Error],
+        "3 % or more of the light is not explained by the masks, and no dark frames were named",
+        "record dark frames (scene_black) with the LCoS all black, at the measurement's exposure and gain, and name \
+         them as `dark`";
+    WrongDark: [Calibration, Measurement], [Warning, Error],
+        "the dark frames do not belong to these captures",
+        "record the dark frames (`black` and `black_with_mask`, or the measurement's `dark`) again with the LCoS all \
+         black, at the exposure, gain and room light of the captures they are subtracted from";
+    Negative: [Measurement], [Warning, Error],
+        "parts of the image are below 0 by more than noise",
+        "record the dark frames again at the measurement's exposure; if dark frames were subtracted before the \
+         upload, send the raw camera values and name the dark frames as `dark`";
+    NegativeOffset: [Measurement], [Warning, Error],
+        "too much was subtracted before the upload",
+        "send the raw camera values and name the dark frames as `dark`, so that the service subtracts them";
+    Mosaic: [Measurement], [Error],
+        "the image looks like the raw mosaic of a colour sensor",
+        "state the `mosaic` of the sensor with the calibration, or export both captures and measurement in grey";
+    ShiftedMasks: [Measurement], [Error],
+        "the masks fit better when shifted (by up to 32 pixels)",
+        "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
+         calibration: calibrate again (a job with `registration` auto corrects up to 4 pixels)";
+    DriftedMasks: [Measurement], [Warning],
+        "the masks are displaced by a fraction of a pixel",
+        "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
+         finding stays, record dark frames and name them as `dark`";
+    MovedMasks: [Job], [Warning],
+        "the masks have moved since the calibration; the job has corrected them",
+        "calibrate again once the optics are stable";
+    TurnedMasks: [Measurement], [Error],
+        "the masks fit when they are flipped or their rows and columns exchanged",
+        "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
+         calibration again";
+    ForeignMasks: [Measurement], [Error],
+        "the masks do not explain the measurement",
+        "name the calibration that belongs to this measurement, or calibrate again";
+    InvertedMasks: [Measurement], [Error],
+        "the masks are inverted: open pixels are 0, closed ones 1",
+        "create a new calibration with 1 - C as the masks";
+    FastMotion: [Result], [Warning],
+        "fast motion may be reconstructed too smooth",
+        "shorten the frames, or use fewer frames in a snapshot";
+    UnfamiliarMasks: [Result], [Warning],
+        "the expected PSNR is unreliable behind these masks",
+        "do not rely on the expected PSNR; simulate a similar scene behind these masks instead";
+    UnevenError: [Result], [Warning],
+        "a part of the picture is expected to be much worse than the rest",
+        "look at the map of the expected error before relying on this part";
+    NoTileWorkers: [Job], [Warning],
+        "no worker takes tiles, so the job makes no progress",
+        "ask the administrator to start workers: `serve --workers N` on the machine of the service, or `sci-recon \
+         worker` on another one";
+    UnexplainedPixels: [Result], [Error],
+        "the frames do not predict pixels that were withheld from the reconstruction",
+        "check that the masks belong to this measurement, unflipped and in its pixel grid, and that the measurement \
+         is not mostly noise; then calibrate again";
+    ExchangedMasks: [Result], [Error],
+        "two masks are probably exchanged",
+        "check that the masks are in the order in which the LCoS shows the patterns during a measurement";
+}
+
 impl FindingCode {
     /// The code as it appears in reports and in the API.
     pub fn as_str(self) -> &'static str {
         self.into()
-    }
-
-    /// The description of this code.
-    pub const fn entry(self) -> Entry {
-        use Severity::{Error, Warning};
-        use Subject::{Calibration, Job, Measurement, Result};
-        const REPEAT_PATTERNS: &str =
-            "check the LCoS pattern sequence and its trigger, then record again";
-        const REDUCE_EXPOSURE: &str =
-            "reduce the exposure of the whole calibration and record all captures again";
-        const SEND_RAW_VALUES: &str = "send the raw camera values and name the dark frames as `dark`, so that the service subtracts them";
-        const NAME_A_DARK: &str = "record dark frames (scene_black) with the LCoS all black, at the \
-                                   measurement's exposure and gain, and name them as `dark`";
-        let (subjects, severity, worst, title, remedy): (&[Subject], _, _, _, _) = match self {
-            Self::DeadPixels => (
-                &[Calibration],
-                Warning,
-                Error,
-                "pixels are dark in every mask",
-                "look at the Gram map of the report: dust or a displaced mask darkens whole areas, too few repeats \
-                 darken single pixels",
-            ),
-            Self::StuckPixels => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "pixels are open in every mask",
-                "check the sensor for hot pixels and the captures for saturation",
-            ),
-            Self::OneDimensional => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "the masks vary along one axis only",
-                "check that the file has the axes [frame, row, column], and that the lithography mask is in place",
-            ),
-            Self::MissingPattern => (
-                &[Calibration, Measurement],
-                Error,
-                Error,
-                "a pattern was not shown",
-                REPEAT_PATTERNS,
-            ),
-            Self::UnevenPatterns => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "a pattern is more than 30 % brighter or darker than the median",
-                REPEAT_PATTERNS,
-            ),
-            Self::RepeatedPattern => {
-                (&[Calibration], Error, Error, "two masks show the same pattern", REPEAT_PATTERNS)
-            }
-            Self::SwappedOrder => (
-                &[Calibration],
-                Error,
-                Error,
-                "the masks are not in the order of the patterns",
-                "list the captures in the order in which the LCoS shows the patterns during a measurement",
-            ),
-            Self::Correlated => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "the masks are highly correlated",
-                "use patterns that overlap less, more sub-apertures, or a sharper projection (check the mask distance \
-                 and aberrations)",
-            ),
-            Self::MaskScale => (
-                &[Calibration, Measurement],
-                Warning,
-                Warning,
-                "the largest mask value is far below the full scale",
-                "state the `full_scale` of the masks, not of the measurement: the stored number that means fully open, \
-                 for example 15 for 4-bit values, 4095 for 12-bit values stored in 16 bits",
-            ),
-            Self::WeakModulation => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "the masks hardly differ from frame to frame",
-                "focus the projection of the lithography mask, and check that the LCoS pattern changes",
-            ),
-            Self::Pedestal => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "closed mask pixels let light through",
-                "record `black_with_mask` again with the LCoS running and all black, so that it contains the leakage",
-            ),
-            Self::SaturatedWhite => (
-                &[Calibration],
-                Warning,
-                Error,
-                "pixels of the white image are saturated",
-                REDUCE_EXPOSURE,
-            ),
-            Self::SaturatedPatterns => {
-                (&[Calibration], Error, Error, "pixels of a pattern are saturated", REDUCE_EXPOSURE)
-            }
-            Self::DarkIllumination => (
-                &[Calibration],
-                Warning,
-                Error,
-                "the white image is hardly brighter than the black one",
-                "illuminate the white board up to the corners, and check that white and black are not interchanged",
-            ),
-            Self::UnevenIllumination => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "the illumination is uneven",
-                "illuminate the white board evenly, and check the aperture for vignetting",
-            ),
-            Self::NoRepeats => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "captures have no repeats, so the noise is unknown",
-                "record each capture several times; the paper uses 50 repeats",
-            ),
-            Self::NoisyMasks => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "the masks are noisy",
-                "record more repeats or increase the exposure",
-            ),
-            Self::LightDrift => (
-                &[Calibration],
-                Warning,
-                Warning,
-                "the light changed during the repeats",
-                "let the lamp and the LCoS warm up, and fix exposure and gain",
-            ),
-            Self::BadCalibration => (
-                &[Measurement],
-                Error,
-                Error,
-                "the calibration is graded `bad`",
-                "read the calibration's report, correct the problems it lists, and calibrate again",
-            ),
-            Self::Saturated => (
-                &[Measurement],
-                Warning,
-                Error,
-                "pixels are saturated",
-                "reduce the exposure time or stop down the lens; if the value is a valid reading, state a higher `saturation`",
-            ),
-            Self::BadPixels => (
-                &[Measurement],
-                Warning,
-                Error,
-                "pixels are hot, dead, or marked as not measured",
-                "nothing, if there are few; name a map of the sensor's bad pixels as `bad_pixels` of the calibration",
-            ),
-            Self::BinaryMeasurement => (
-                &[Measurement],
-                Error,
-                Error,
-                "a snapshot has only two values, as masks have, or is a copy of a mask",
-                "send the snapshots of the camera as the measurement, and the masks to the calibration",
-            ),
-            Self::EmptySnapshot => (
-                &[Measurement],
-                Warning,
-                Warning,
-                "a snapshot is 0 everywhere, or has no finite value",
-                "check the trigger of the camera; the frames of this snapshot are black",
-            ),
-            Self::LeftAligned => (
-                &[Measurement],
-                Warning,
-                Warning,
-                "12-bit values are left-aligned in 16 bits",
-                "state 65520 as `saturation`; the `full_scale` is the number that one frame adds, at most 65520",
-            ),
-            Self::RightAligned => (
-                &[Measurement],
-                Warning,
-                Warning,
-                "12-bit values are right-aligned in 16 bits",
-                "if the camera has 12 bits, state 4095 as `saturation`; the `full_scale` is the number that one frame adds, at most 4095",
-            ),
-            Self::Level => (
-                &[Measurement, Result],
-                Warning,
-                Warning,
-                "the brightness of the scene is implausible, for example below 0.12 or above 1.1 of the full scale in its brightest parts",
-                "state the `full_scale` of the measurement for its exposure and bit depth",
-            ),
-            Self::NoDark => (
-                &[Measurement],
-                Warning,
-                Error,
-                "the masks do not explain 3 % or more of the light, and no dark frames were named",
-                NAME_A_DARK,
-            ),
-            Self::WrongDark => (
-                &[Calibration, Measurement],
-                Warning,
-                Error,
-                "the dark frames do not belong to these captures",
-                "record the dark frames (`black` and `black_with_mask`, or the measurement's `dark`) again with the LCoS \
-                 all black, at the exposure, gain and room light of the captures they are subtracted from",
-            ),
-            Self::Negative => (
-                &[Measurement],
-                Warning,
-                Error,
-                "parts of the image are below 0 by more than noise",
-                "record the dark frames again at the measurement's exposure; if dark frames were subtracted before the \
-                 upload, send the raw camera values and name the dark frames as `dark`",
-            ),
-            Self::NegativeOffset => (
-                &[Measurement],
-                Warning,
-                Error,
-                "too much was subtracted before the upload",
-                SEND_RAW_VALUES,
-            ),
-            Self::Mosaic => (
-                &[Measurement],
-                Error,
-                Error,
-                "the image looks like the raw mosaic of a colour sensor",
-                "state the `mosaic` of the sensor with the calibration, or export both captures and measurement in grey",
-            ),
-            Self::ShiftedMasks => (
-                &[Measurement],
-                Error,
-                Error,
-                "the masks fit better when shifted (by up to 32 pixels)",
-                "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
-                 calibration: calibrate again (a job with `registration` auto corrects up to 4 pixels)",
-            ),
-            Self::DriftedMasks => (
-                &[Measurement],
-                Warning,
-                Warning,
-                "the masks are displaced by a fraction of a pixel",
-                "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
-                 finding stays, record dark frames and name them as `dark`",
-            ),
-            Self::MovedMasks => (
-                &[Job],
-                Warning,
-                Warning,
-                "the masks have moved since the calibration; the job has corrected them",
-                "calibrate again once the optics are stable",
-            ),
-            Self::TurnedMasks => (
-                &[Measurement],
-                Error,
-                Error,
-                "the masks fit when they are flipped or their rows and columns exchanged",
-                "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
-                 calibration again",
-            ),
-            Self::ForeignMasks => (
-                &[Measurement],
-                Error,
-                Error,
-                "the masks do not explain the measurement",
-                "name the calibration that belongs to this measurement, or calibrate again",
-            ),
-            Self::InvertedMasks => (
-                &[Measurement],
-                Error,
-                Error,
-                "the masks are inverted: open pixels are 0, closed ones 1",
-                "send 1 - C as the masks, and make the calibration again",
-            ),
-            Self::FastMotion => (
-                &[Result],
-                Warning,
-                Warning,
-                "fast motion may be reconstructed too smooth",
-                "shorten the frames, or use fewer frames in a snapshot",
-            ),
-            Self::UnfamiliarMasks => (
-                &[Result],
-                Warning,
-                Warning,
-                "the expected PSNR is unreliable behind these masks",
-                "do not rely on the expected PSNR; simulate a similar scene behind these masks instead",
-            ),
-            Self::UnevenError => (
-                &[Result],
-                Warning,
-                Warning,
-                "a part of the picture is expected to be much worse than the rest",
-                "look at the map of the expected error before relying on this part",
-            ),
-            Self::NoTileWorkers => (
-                &[Job],
-                Warning,
-                Warning,
-                "no worker takes tiles, so the job makes no progress",
-                "ask the administrator to start workers: `serve --workers N` on the machine of the service, or \
-                 `sci-recon worker` on another one",
-            ),
-            Self::ExchangedMasks => (
-                &[Result],
-                Error,
-                Error,
-                "two masks are probably exchanged",
-                "check that the masks are in the order in which the LCoS shows the patterns during a measurement",
-            ),
-            Self::UnexplainedPixels => (
-                &[Result],
-                Error,
-                Error,
-                "the frames do not predict pixels that were withheld from the reconstruction",
-                "check that the masks belong to this measurement, unflipped and in its pixel grid, and that the \
-                 measurement is not mostly noise; then calibrate again",
-            ),
-        };
-        Entry { subjects, severity, worst, title, remedy }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Geometry of the camera, and the mask shift that follows from it.
 
-use super::{OpticsError, Result};
+use super::{Result, check_parameter};
 
 /// The hybrid coded aperture: an LCoS in the aperture of a 4f system, a lithography mask in front of its image plane,
 /// and a relay to the sensor. The defaults are those of the paper's simulation.
@@ -54,7 +54,7 @@ const MAX_SHIFT: f64 = 1000.0;
 impl Geometry {
     /// Checks all parameters.
     ///
-    /// Errors: [`OpticsError::Parameter`] that names the first one out of range.
+    /// Errors: [`OpticsError::Parameter`](super::OpticsError::Parameter) that names the first one out of range.
     pub fn check(&self) -> Result<()> {
         let lengths = [
             ("lcos pitch_um", self.lcos_pitch_um),
@@ -65,37 +65,29 @@ impl Geometry {
             ("sensor pitch_um", self.sensor_pitch_um),
         ];
         for (name, value) in lengths {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(refused(name, value, "a finite number above 0"));
-            }
+            let fits = value.is_finite() && value > 0.0;
+            check_parameter(fits, name, value, "a finite number above 0")?;
         }
         for (name, value) in [("lcos rows", self.lcos_rows), ("lcos columns", self.lcos_columns)] {
-            if !(1..=1 << 16).contains(&value) {
-                return Err(refused(name, value, "from 1 to 65536 pixels"));
-            }
+            let fits = (1..=1 << 16).contains(&value);
+            check_parameter(fits, name, value, "from 1 to 65536 pixels")?;
         }
-        if !(self.blur_um >= 0.0 && self.blur() <= MAX_SHIFT) {
-            return Err(refused("projection blur_um", self.blur_um, "0 to 1000 mask pixels"));
-        }
+        let fits = self.blur_um >= 0.0 && self.blur() <= MAX_SHIFT;
+        check_parameter(fits, "projection blur_um", self.blur_um, "0 to 1000 mask pixels")?;
         for (name, value) in
             [("phase_rows", self.phase_rows), ("phase_columns", self.phase_columns)]
         {
-            if !(-MAX_SHIFT..=MAX_SHIFT).contains(&value) {
-                return Err(refused(name, value, "-1000 to 1000 mask pixels"));
-            }
+            let fits = (-MAX_SHIFT..=MAX_SHIFT).contains(&value);
+            check_parameter(fits, name, value, "-1000 to 1000 mask pixels")?;
         }
         let ratio = self.sensor_pixels_per_mask_pixel();
-        if !(0.1..=64.0).contains(&ratio) {
-            let range = "such that 0.1 to 64 sensor pixels show a mask pixel (magnification x mask \
-                         pitch / sensor pitch)";
-            return Err(refused("relay magnification", self.magnification, range));
-        }
+        let range = "such that 0.1 to 64 sensor pixels show a mask pixel (magnification x mask \
+                     pitch / sensor pitch)";
+        let fits = (0.1..=64.0).contains(&ratio);
+        check_parameter(fits, "relay magnification", self.magnification, range)?;
         let widest = self.lcos_rows.max(self.lcos_columns) as f64 * self.shift_per_lcos_pixel();
-        if widest > MAX_SHIFT {
-            let range = "such that the aperture shifts the mask by at most 1000 mask pixels";
-            return Err(refused("mask distance_um", self.mask_distance_um, range));
-        }
-        Ok(())
+        let range = "such that the aperture shifts the mask by at most 1000 mask pixels";
+        check_parameter(widest <= MAX_SHIFT, "mask distance_um", self.mask_distance_um, range)
     }
 
     /// Shift of the projected mask, in mask pixels, when the opening moves by one LCoS pixel: mask distance x LCoS
@@ -114,10 +106,6 @@ impl Geometry {
     pub(super) fn blur(&self) -> f64 {
         self.blur_um / self.mask_pitch_um
     }
-}
-
-fn refused(name: &'static str, value: impl ToString, range: &'static str) -> OpticsError {
-    OpticsError::Parameter { name, value: value.to_string(), range }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use ndarray::{Array3, ArrayViewMut1, Axis, Zip};
 
-use super::{OpticsError, Result};
+use super::{Result, check_parameter};
 
 /// Radius of the blur kernel in standard deviations.
 const KERNEL_RADIUS: f64 = 4.0;
@@ -14,16 +14,10 @@ const MAX_BLUR: f64 = 50.0;
 /// Masks are blurred by a Gaussian with a standard deviation of `blur` pixels, reflected at the edges. The result is
 /// `leak + (1 - leak) C`: closed pixels transmit the share `leak` of the light of open ones.
 ///
-/// Errors: [`OpticsError::Parameter`] unless `blur` is on \[0,50\] and `leak` on \[0,1).
+/// Errors: [`OpticsError::Parameter`](super::OpticsError::Parameter) unless `blur` is on \[0,50\] and `leak` on \[0,1).
 pub fn soften(masks: &mut Array3<f32>, blur: f64, leak: f32) -> Result<()> {
-    if !(0.0..=MAX_BLUR).contains(&blur) {
-        let range = "from 0 to 50 pixels";
-        return Err(OpticsError::Parameter { name: "blur", value: blur.to_string(), range });
-    }
-    if !(0.0..1.0).contains(&leak) {
-        let range = "from 0 to less than 1";
-        return Err(OpticsError::Parameter { name: "leak", value: leak.to_string(), range });
-    }
+    check_parameter((0.0..=MAX_BLUR).contains(&blur), "blur", blur, "from 0 to 50 pixels")?;
+    check_parameter((0.0..1.0).contains(&leak), "leak", leak, "from 0 to less than 1")?;
     if blur > 0.0 {
         let kernel = kernel(blur);
         for axis in [Axis(1), Axis(2)] {

@@ -93,13 +93,24 @@ pub fn generator(seed: u64) -> rand_chacha::ChaCha8Rng {
     rand::SeedableRng::seed_from_u64(seed)
 }
 
+/// Returns an error unless the value of a parameter `fits` its range.
+fn check_parameter(
+    fits: bool,
+    name: &'static str,
+    value: impl ToString,
+    range: &'static str,
+) -> Result<()> {
+    if fits {
+        Ok(())
+    } else {
+        Err(OpticsError::Parameter { name, value: value.to_string(), range })
+    }
+}
+
 /// Returns an error if a size is 0.
 fn check_size(frames: usize, height: usize, width: usize) -> Result<()> {
-    for (name, value) in [("compression ratio", frames), ("height", height), ("width", width)] {
-        if value == 0 {
-            let range = "at least 1";
-            return Err(OpticsError::Parameter { name, value: value.to_string(), range });
-        }
-    }
-    Ok(())
+    let sizes = [("compression ratio", frames), ("height", height), ("width", width)];
+    sizes
+        .into_iter()
+        .try_for_each(|(name, size)| check_parameter(size > 0, name, size, "at least 1"))
 }

@@ -106,7 +106,7 @@ struct Fit {
 }
 
 /// Statistics of a measurement with respect to its masks. Values are shares of the measurement's full scale.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct MeasurementFigures {
     /// Mean of the measurement.
     pub mean: f64,
@@ -289,17 +289,11 @@ impl MeasurementStudy {
             negative_area,
             brightness: vec![0.0; self.frames],
             uncertainty: vec![0.0; self.frames],
-            offset: 0.0,
-            offset_uncertainty: 0.0,
-            shift: (0, 0),
             explained,
             explained_unshifted: explained,
-            shift_significance: 0.0,
-            mosaic: PhaseDifference::default(),
-            local_mosaic: PhaseDifference::default(),
-            drift: [Drift::default(); 2],
             brightest: brightest(&self.strips, 0.0),
             is_flat: true,
+            ..MeasurementFigures::default()
         }
     }
 }

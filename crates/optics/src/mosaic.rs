@@ -16,22 +16,10 @@ const BLUE: usize = 2;
 pub const MARGIN: usize = 2;
 
 /// A Bayer pattern, named by the colours of its 2x2 cell, row by row.
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    Hash,
-    Serialize,
-    Deserialize,
-    Display,
-    EnumString,
-    VariantNames,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Serialize, Deserialize, Display, EnumString, VariantNames, schemars::JsonSchema)]
 #[serde(rename_all = "lowercase")]
 #[strum(serialize_all = "lowercase")]
-#[derive(schemars::JsonSchema)]
 pub enum Mosaic {
     /// Red and green, then green and blue.
     Rggb,

@@ -3,7 +3,7 @@
 use rand::Rng;
 use rand::seq::index;
 
-use super::{OpticsError, Result};
+use super::{OpticsError, Result, check_parameter};
 
 /// Options for drawing random patterns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,13 +24,9 @@ impl Draw {
 
     /// The required rank, checked against what `frames` patterns of `apertures` sub-apertures allow.
     fn required_rank(self, frames: usize, apertures: usize) -> Result<usize> {
-        if self.open == 0 || self.open > apertures {
-            return Err(OpticsError::Parameter {
-                name: "open sub-apertures",
-                value: format!("{} of {apertures}", self.open),
-                range: "at least 1 and at most all of them",
-            });
-        }
+        let (fits, value) =
+            ((1..=apertures).contains(&self.open), format!("{} of {apertures}", self.open));
+        check_parameter(fits, "open sub-apertures", value, "at least 1 and at most all of them")?;
         // With all sub-apertures open there is only one pattern.
         let possible = if self.open == apertures { 1 } else { frames.min(apertures) };
         match self.rank {

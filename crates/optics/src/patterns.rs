@@ -7,7 +7,7 @@ use rand::seq::index;
 use serde::{Deserialize, Serialize};
 
 use super::multiplex::rank;
-use super::{Geometry, Multiplexing, OpticsError, Result, check_size};
+use super::{Geometry, Multiplexing, OpticsError, Result, check_parameter, check_size};
 
 /// Side, in LCoS pixels, of the cells in which circles are drawn. Their shift of the mask is far below a mask pixel.
 const CIRCLE_CELL: usize = 8;
@@ -123,17 +123,11 @@ impl Circle {
     }
 
     fn check(self, geometry: &Geometry) -> Result<()> {
-        let refused = |name, value: f64, range| OpticsError::Parameter {
-            name,
-            value: value.to_string(),
-            range,
-        };
-        if !(self.radius_pixels.is_finite() && self.radius_pixels > 0.0) {
-            return Err(refused("circle radius_pixels", self.radius_pixels, "a number above 0"));
-        }
-        if !(self.centre_pixels.is_finite() && self.centre_pixels >= 0.0) {
-            return Err(refused("circle centre_pixels", self.centre_pixels, "at least 0"));
-        }
+        let (radius, centre) = (self.radius_pixels, self.centre_pixels);
+        let fits = radius.is_finite() && radius > 0.0;
+        check_parameter(fits, "circle radius_pixels", radius, "a number above 0")?;
+        let fits = centre.is_finite() && centre >= 0.0;
+        check_parameter(fits, "circle centre_pixels", centre, "at least 0")?;
         let edge = geometry.lcos_rows.min(geometry.lcos_columns) as f64 / 2.0;
         let reach = self.radius_pixels + self.centre_pixels;
         if reach > edge {

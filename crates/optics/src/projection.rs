@@ -6,7 +6,7 @@ use rayon::slice::ParallelSliceMut;
 use serde::{Deserialize, Serialize};
 
 use super::axis::{Axis, Cell};
-use super::{Geometry, OpticsError, Result, check_size};
+use super::{Geometry, OpticsError, Result, check_parameter, check_size};
 
 /// How the shift of the mask by an aperture cell is computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,10 +66,8 @@ impl Projector {
             ("pattern rows", cells.0, geometry.lcos_rows),
             ("pattern columns", cells.1, geometry.lcos_columns),
         ] {
-            if !(1..=pixels).contains(&count) {
-                let range = "at least 1 and at most the number of LCoS pixels";
-                return Err(OpticsError::Parameter { name, value: count.to_string(), range });
-            }
+            let range = "at least 1 and at most the number of LCoS pixels";
+            check_parameter((1..=pixels).contains(&count), name, count, range)?;
         }
         Ok(Self {
             rows: axis(geometry.lcos_rows, cells.0, sensor.0, geometry.phase_rows)?,

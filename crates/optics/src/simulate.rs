@@ -3,7 +3,7 @@
 use ndarray::{Array2, ArrayView3};
 use rand_distr::{Distribution, Normal};
 
-use super::{OpticsError, Result, generator};
+use super::{OpticsError, Result, check_parameter, generator};
 
 /// The forward model `y = sum_k C_k x_k` \[H,W\] for masks C and frames x \[B,H,W\], both on \[0,1\].
 ///
@@ -25,18 +25,10 @@ pub fn measure(masks: ArrayView3<'_, f32>, frames: ArrayView3<'_, f32>) -> Resul
 ///
 /// Errors: [`OpticsError::Parameter`] unless `sigma` is finite and at least 0.
 pub fn noisy(y: Array2<f32>, sigma: f32, seed: u64) -> Result<Array2<f32>> {
-    let refused = || OpticsError::Parameter {
-        name: "noise sigma",
-        value: sigma.to_string(),
-        range: "a finite number of at least 0",
-    };
-    if !(sigma.is_finite() && sigma >= 0.0) {
-        return Err(refused());
-    }
-    if sigma == 0.0 {
-        return Ok(y);
-    }
-    let noise = Normal::new(0.0, sigma).map_err(|_| refused())?;
+    let normal = Normal::new(0.0, sigma).ok().filter(|_| sigma >= 0.0);
+    let range = "a finite number of at least 0";
+    check_parameter(normal.is_some(), "noise sigma", sigma, range)?;
+    let Some(noise) = normal.filter(|_| sigma > 0.0) else { return Ok(y) };
     // A separate stream: the noise is independent of masks drawn from the same seed.
     let mut rng = generator(seed);
     rng.set_stream(1);

@@ -46,30 +46,34 @@ pub(crate) fn iterate(
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use crate::reference::{Problem, max_difference};
 
     /// The equations above in 64 bits and voxel by voxel.
+    pub(crate) fn reference(problem: &Problem) -> Vec<f64> {
+        let stage = &problem.schedule.stages[0];
+        let (mut v, mut ahead, mut u) = (problem.zeros(), problem.zeros(), problem.zeros());
+        let mut y1 = vec![0.0; problem.pixels()];
+        for _ in 0..stage.iterations {
+            let start: Vec<f64> = ahead.iter().zip(&u).map(|(v, u)| v + u).collect();
+            let x = problem.project(&start, &mut y1);
+            let mut new: Vec<f64> = x.iter().zip(&u).map(|(x, u)| x - u).collect();
+            problem.denoise(&mut new);
+            for (u, (x, v)) in u.iter_mut().zip(x.iter().zip(&new)) {
+                *u -= x - v;
+            }
+            let momentum = f64::from(stage.momentum);
+            ahead = new.iter().zip(&v).map(|(new, old)| new + momentum * (new - old)).collect();
+            v = new;
+        }
+        v
+    }
+
     #[test]
     fn iterations_are_those_of_the_equations() {
         for seed in 0..12 {
             let problem = Problem::random(seed, "admm");
-            let stage = &problem.schedule.stages[0];
-            let (mut v, mut ahead, mut u) = (problem.zeros(), problem.zeros(), problem.zeros());
-            let mut y1 = vec![0.0; problem.pixels()];
-            for _ in 0..stage.iterations {
-                let start: Vec<f64> = ahead.iter().zip(&u).map(|(v, u)| v + u).collect();
-                let x = problem.project(&start, &mut y1);
-                let mut new: Vec<f64> = x.iter().zip(&u).map(|(x, u)| x - u).collect();
-                problem.denoise(&mut new);
-                for (u, (x, v)) in u.iter_mut().zip(x.iter().zip(&new)) {
-                    *u -= x - v;
-                }
-                let momentum = f64::from(stage.momentum);
-                ahead = new.iter().zip(&v).map(|(new, old)| new + momentum * (new - old)).collect();
-                v = new;
-            }
-            let difference = max_difference(&problem.solve(), &v);
+            let difference = max_difference(&problem.solve(), &reference(&problem));
             assert!(difference < 1e-5, "{seed}: {difference}, {:?}", problem.schedule);
         }
     }

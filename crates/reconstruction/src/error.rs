@@ -58,6 +58,34 @@ pub enum ReconError {
     Cancelled,
 }
 
+/// Refuses a parameter unless its value `fits` the range.
+///
+/// # Errors
+/// [`ReconError::Parameter`].
+pub fn check_parameter(
+    fits: bool,
+    name: &'static str,
+    value: impl ToString,
+    range: &'static str,
+) -> Result<()> {
+    let (name, value, range) = (name.into(), value.to_string(), range.into());
+    if fits { Ok(()) } else { Err(ReconError::Parameter { name, value, range }) }
+}
+
+/// Refuses an array unless its size `fits`.
+///
+/// # Errors
+/// [`ReconError::Shape`].
+pub fn check_shape(
+    fits: bool,
+    what: &'static str,
+    found: impl Into<String>,
+    expected: impl Into<String>,
+) -> Result<()> {
+    let (found, expected) = (found.into(), expected.into());
+    if fits { Ok(()) } else { Err(ReconError::Shape { what, found, expected }) }
+}
+
 /// `1x2x3` from `[1, 2, 3]`, for messages.
 pub(crate) fn shape_text(shape: &[usize]) -> String {
     let sides: Vec<String> = shape.iter().map(usize::to_string).collect();

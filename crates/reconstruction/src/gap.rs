@@ -19,9 +19,13 @@ use ndarray::{Array3, ArrayView3, azip};
 
 use super::admm;
 use super::error::{ReconError, Result};
+#[cfg(feature = "gpu")]
+use super::gpu::resident::{Resident, Variation};
 use super::iterate::{Iterate, Variables};
 use super::operator::{SensingOperator, Statistics};
 use super::priors::{Networks, Prior};
+#[cfg(feature = "gpu")]
+use super::priors::{registry::PriorSpec, tv::TvSpec};
 use super::progress::{Control, Observer, Progress};
 use super::projection::{Problem, Projection, Settings, Step};
 use super::schedule::{Method, Schedule};
@@ -29,8 +33,8 @@ use super::stage::{ProjectionSpec, Stage};
 
 /// Runs a stage: up to `stage.iterations` times projection, prior and extrapolation.
 ///
-/// `after` sees the frames `v` after each iteration, and true after the last one; it may end the stage. Returns true if the
-/// stage converged before its last iteration.
+/// `after` sees the frames `v` after the last iteration, and after each one of a prior with a noise level; it may end the
+/// stage. Returns true if the stage converged before its last iteration.
 ///
 /// # Errors
 /// A network fails, the frames are no longer finite, or [`ReconError::Cancelled`] if the observer asks for it.
@@ -38,17 +42,27 @@ pub(crate) fn run_stage(
     solver: &mut Solver<'_>,
     (index, stage): (usize, &Stage),
     observer: &mut dyn Observer,
-    mut after: impl FnMut(ArrayView3<'_, f32>, bool) -> ControlFlow<()>,
+    mut after: impl FnMut(ArrayView3<'_, f32>) -> ControlFlow<()>,
 ) -> Result<bool> {
     let Solver { problem, method, gamma, y_norm, iterate, networks, counts } = solver;
     let settings = settings(problem.operator, stage, *gamma);
-    let mut prior = stage.prior.start(problem.operator.dim(), &mut **networks)?;
+    let mut place = Place::choose(*problem, &settings, stage, &mut **networks, iterate)?;
     for iteration in 0..stage.iterations {
         let sigma = stage.sigma_at(iteration);
         let level = sigma.unwrap_or(0.0);
-        let step = match method {
-            Method::Gap => self::iterate(*problem, &settings, &mut *prior, level, iterate)?,
-            Method::Admm => admm::iterate(*problem, &settings, &mut *prior, level, iterate)?,
+        let (step, is_below) = match &mut place {
+            #[cfg(feature = "gpu")]
+            Place::Gpu(resident) => resident.step()?,
+            Place::Cpu(prior) => {
+                let step = match method {
+                    Method::Gap => self::iterate(*problem, &settings, &mut **prior, level, iterate),
+                    Method::Admm => {
+                        admm::iterate(*problem, &settings, &mut **prior, level, iterate)
+                    }
+                }?;
+                let is_below = step.change.relative() < stage.tolerance;
+                (step, is_below)
+            }
         };
         let residual = (step.squared_residual.sqrt() / *y_norm) as f32;
         let change = step.change.relative();
@@ -57,7 +71,7 @@ pub(crate) fn run_stage(
             return Err(ReconError::Diverged { iteration: counts.done, planned: counts.planned });
         }
         let remaining = stage.iterations - iteration - 1;
-        let converged = change < stage.tolerance && remaining > 0;
+        let converged = is_below && remaining > 0;
         if converged {
             counts.planned = counts.planned.saturating_sub(remaining);
         }
@@ -66,11 +80,47 @@ pub(crate) fn run_stage(
         if observer.iteration(&progress) == Control::Cancel {
             return Err(ReconError::Cancelled);
         }
-        if after(iterate.v.view(), converged || remaining == 0).is_break() || converged {
+        let is_last = converged || remaining == 0;
+        #[cfg(feature = "gpu")]
+        if let (Place::Gpu(resident), true) = (&place, is_last) {
+            resident.download(iterate)?;
+        }
+        let is_seen = is_last || sigma.is_some();
+        if is_seen && after(iterate.v.view()).is_break() || converged {
             return Ok(converged);
         }
     }
     Ok(false)
+}
+
+/// The device that runs the iterations of a stage.
+enum Place<'a> {
+    Cpu(Box<dyn Prior + 'a>),
+    #[cfg(feature = "gpu")]
+    Gpu(Box<Resident>),
+}
+
+impl<'a> Place<'a> {
+    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
+    fn choose(
+        problem: Problem<'_>,
+        settings: &Settings,
+        stage: &Stage,
+        networks: &'a mut dyn Networks,
+        iterate: &Iterate,
+    ) -> Result<Self> {
+        #[cfg(feature = "gpu")]
+        if let PriorSpec::Tv(tv) = &stage.prior
+            && let Some(gpu) = networks.gpu()?
+        {
+            let &Stage { iterations, tolerance, .. } = stage;
+            let &TvSpec { tv_weight: weight, temporal_weight, tv_updates: updates } = tv;
+            let stage = Variation { weight, temporal_weight, updates, iterations, tolerance };
+            let resident = Resident::new(gpu, problem, settings, stage, iterate)?;
+            return Ok(Self::Gpu(Box::new(resident)));
+        }
+        Ok(Self::Cpu(stage.prior.start(problem.operator.dim(), networks)?))
+    }
 }
 
 /// One iteration, on the variables in `iterate`.
@@ -174,25 +224,30 @@ impl<'a> Solver<'a> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use crate::reference::{Problem, max_difference};
 
-    /// The equations above in 64 bits and voxel by voxel, with GAP's own projection and with an error covariance.
+    /// The equations above in 64 bits and voxel by voxel.
+    pub(crate) fn reference(problem: &Problem) -> Vec<f64> {
+        let stage = &problem.schedule.stages[0];
+        let (mut v, mut start) = (problem.zeros(), problem.zeros());
+        let mut y1 = vec![0.0; problem.pixels()];
+        for _ in 0..stage.iterations {
+            let mut x = problem.project(&start, &mut y1);
+            problem.denoise(&mut x);
+            let momentum = f64::from(stage.momentum);
+            start = x.iter().zip(&v).map(|(new, old)| new + momentum * (new - old)).collect();
+            v = x;
+        }
+        v
+    }
+
+    /// With GAP's own projection and with an error covariance.
     #[test]
     fn iterations_are_those_of_the_equations() {
         for seed in 0..12 {
             let problem = Problem::random(seed, "gap");
-            let stage = &problem.schedule.stages[0];
-            let (mut v, mut start) = (problem.zeros(), problem.zeros());
-            let mut y1 = vec![0.0; problem.pixels()];
-            for _ in 0..stage.iterations {
-                let mut x = problem.project(&start, &mut y1);
-                problem.denoise(&mut x);
-                let momentum = f64::from(stage.momentum);
-                start = x.iter().zip(&v).map(|(new, old)| new + momentum * (new - old)).collect();
-                v = x;
-            }
-            let difference = max_difference(&problem.solve(), &v);
+            let difference = max_difference(&problem.solve(), &reference(&problem));
             assert!(difference < 1e-5, "{seed}: {difference}, {:?}", problem.schedule);
         }
     }

@@ -72,6 +72,12 @@ pub(crate) struct Change {
 }
 
 impl Change {
+    /// The change with these squared norms.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn new(difference: f64, norm: f64) -> Self {
+        Self { difference, norm }
+    }
+
     /// The change from all of `old` to `new`.
     pub(crate) fn between(new: &Array3<f32>, old: &Array3<f32>) -> Self {
         let mut change = Self::default();

@@ -7,7 +7,7 @@ use std::fmt;
 
 use ndarray::{Array3, ArrayView2, ArrayView3};
 
-use super::error::{ReconError, Result, shape_text};
+use super::error::{Result, check_shape, shape_text};
 
 /// An input or output of a network.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -52,14 +52,12 @@ pub trait SnapshotNetwork {
 /// Refuses frames \[B,H,W\] that are not finite.
 ///
 /// # Errors
-/// [`ReconError::Shape`]: some values are not finite.
+/// [`super::ReconError::Shape`]: some values are not finite.
 pub fn all_finite(frames: &Array3<f32>) -> Result<()> {
-    let Some(value) = frames.iter().find(|value| !value.is_finite()) else { return Ok(()) };
-    Err(ReconError::Shape {
-        what: "the network's output",
-        found: format!("{value} among others"),
-        expected: format!("1x{} of finite numbers", shape_text(frames.shape())),
-    })
+    let wrong = frames.iter().find(|value| !value.is_finite()).copied();
+    let found = format!("{} among others", wrong.unwrap_or_default());
+    let expected = format!("1x{} of finite numbers", shape_text(frames.shape()));
+    check_shape(wrong.is_none(), "the network's output", found, expected)
 }
 
 /// Name of the input that takes the measurement \[1,1,H,W\].
@@ -74,7 +72,7 @@ impl Interface {
     /// many frames, all float32. Returns the picture sizes that it takes.
     ///
     /// # Errors
-    /// [`ReconError::Shape`] with the actual and the required tensors.
+    /// [`super::ReconError::Shape`] with the actual and the required tensors.
     pub fn check(&self, frames: usize, height: usize, width: usize) -> Result<PictureSize> {
         let names = |tensors: &[TensorInfo]| {
             let mut names: Vec<&str> = tensors.iter().map(|tensor| tensor.name.as_str()).collect();
@@ -82,13 +80,10 @@ impl Interface {
             names.join(", ")
         };
         let (inputs, outputs) = (names(&self.inputs), names(&self.outputs));
-        if inputs != format!("{MASKS}, {MEASUREMENT}") || outputs != FRAMES {
-            return Err(ReconError::Shape {
-                what: "the network's interface",
-                found: format!("inputs {inputs}; outputs {outputs}"),
-                expected: format!("inputs {MASKS}, {MEASUREMENT}; output {FRAMES}"),
-            });
-        }
+        let fits = inputs == format!("{MASKS}, {MEASUREMENT}") && outputs == FRAMES;
+        let found = format!("inputs {inputs}; outputs {outputs}");
+        let expected = format!("inputs {MASKS}, {MEASUREMENT}; output {FRAMES}");
+        check_shape(fits, "the network's interface", found, expected)?;
         let mut size = PictureSize::Free;
         for tensor in self.inputs.iter().chain(&self.outputs) {
             let (what, planes) = match tensor.name.as_str() {
@@ -109,16 +104,10 @@ impl TensorInfo {
     fn check(&self, what: &'static str, needed: [usize; 4]) -> Result<()> {
         let fits = self.sides.len() == needed.len()
             && self.sides.iter().zip(needed).all(|(side, needed)| side.is_none_or(|s| s == needed));
-        if fits && self.element == "float32" {
-            return Ok(());
-        }
         let needed =
             Self { sides: needed.map(Some).into(), element: "float32".into(), ..self.clone() };
-        Err(ReconError::Shape {
-            what,
-            found: self.to_string(),
-            expected: format!("{needed} (that of the masks)"),
-        })
+        let expected = format!("{needed} (that of the masks)");
+        check_shape(fits && self.element == "float32", what, self.to_string(), expected)
     }
 }
 

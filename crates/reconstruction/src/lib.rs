@@ -16,6 +16,8 @@ pub mod error;
 pub mod evidence;
 mod fields;
 mod gap;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod hold_out;
 mod iterate;
 pub mod joints;
@@ -30,6 +32,7 @@ pub mod priors;
 pub mod progress;
 pub mod projection;
 #[cfg(test)]
+#[path = "tests/reference.rs"]
 mod reference;
 pub mod registration;
 pub mod scale;

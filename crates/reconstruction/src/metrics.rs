@@ -2,7 +2,7 @@
 
 use ndarray::{ArrayView2, ArrayView3};
 
-use super::error::{ReconError, Result, shape_text};
+use super::error::{Result, check_shape, shape_text};
 
 /// Side of SSIM's uniform window; smaller frames have no SSIM.
 pub const WINDOW: usize = 7;
@@ -21,13 +21,8 @@ pub fn psnr(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f
 /// border of 3 pixels left out. Frames must be at least 7x7.
 pub fn ssim(frames: ArrayView3<'_, f32>, truth: ArrayView3<'_, f32>) -> Result<f64> {
     let (_, height, width) = frames.dim();
-    if height < WINDOW || width < WINDOW {
-        return Err(ReconError::Shape {
-            what: "a frame for SSIM",
-            found: shape_text(&[height, width]),
-            expected: "at least 7x7".into(),
-        });
-    }
+    let (fits, found) = (height.min(width) >= WINDOW, shape_text(&[height, width]));
+    check_shape(fits, "a frame for SSIM", found, "at least 7x7")?;
     mean_over_frames(frames, truth, ssim_frame)
 }
 
@@ -41,13 +36,9 @@ fn mean_over_frames(
     truth: ArrayView3<'_, f32>,
     metric: impl Fn(ArrayView2<'_, f32>, ArrayView2<'_, f32>) -> f64,
 ) -> Result<f64> {
-    if frames.shape() != truth.shape() || frames.is_empty() {
-        return Err(ReconError::Shape {
-            what: "the frame stack",
-            found: shape_text(frames.shape()),
-            expected: format!("{} (the truth's size)", shape_text(truth.shape())),
-        });
-    }
+    let fits = frames.shape() == truth.shape() && !frames.is_empty();
+    let expected = format!("{} (the truth's size)", shape_text(truth.shape()));
+    check_shape(fits, "the frame stack", shape_text(frames.shape()), expected)?;
     let pairs = frames.outer_iter().zip(truth.outer_iter());
     Ok(pairs.map(|(a, b)| metric(a, b)).sum::<f64>() / frames.dim().0 as f64)
 }

@@ -3,6 +3,8 @@
 use std::ops::Range;
 
 use multiversion::multiversion;
+#[cfg(feature = "gpu")]
+use ndarray::ArrayView1;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis};
 use std::f32::consts::PI;
 
@@ -260,6 +262,49 @@ impl SensingOperator {
             }
         }
         squares
+    }
+
+    /// All that a projection needs besides the masks: `R C` \[B,H,W\], unless `R` is 1, and `(H R H^T + gamma)^-1`
+    /// \[S,H,W\].
+    #[cfg(feature = "gpu")]
+    pub(crate) fn corrections(
+        &self,
+        statistics: &Statistics,
+    ) -> (Option<Array3<f32>>, Array3<f32>) {
+        let Statistics { covariance, gamma } = statistics;
+        let mut weights = self.inverse_gram.clone();
+        let matrix = covariance.as_ref().and_then(|matrix| matrix.as_slice());
+        let (Some(covariance), Some(masks)) = (matrix, self.masks.as_slice()) else {
+            if *gamma > 0.0 {
+                weights.mapv_inplace(|inverse| 1.0 / (1.0 / inverse + gamma));
+            }
+            return (None, weights);
+        };
+        let (frames, height, width) = self.masks.dim();
+        let mut all = Array3::zeros((frames, height, width));
+        let mut directions = vec![0.0; frames * width];
+        let (mut of_row, mut bounds) = (vec![0.0; width], vec![0.0; width]);
+        for row in 0..height {
+            // Snapshots differ only in hold-out pixels, which are 0.
+            let inverses = self.inverse_gram.index_axis(Axis(1), row);
+            let inverse = inverses.fold_axis(Axis(0), 0.0f32, |one, other| one.max(*other));
+            let stack = Stack { plane: height * width, start: row * width, width, frames };
+            let out = RowDirections {
+                directions: &mut directions,
+                weights: &mut of_row,
+                bounds: &mut bounds,
+            };
+            directions_of_row(masks, stack, covariance, *gamma, &inverse.to_vec(), out);
+            for (direction, mut all) in directions.chunks(width).zip(all.outer_iter_mut()) {
+                all.row_mut(row).assign(&ArrayView1::from(direction));
+            }
+            for mut snapshot in weights.outer_iter_mut() {
+                for (weight, new) in snapshot.row_mut(row).iter_mut().zip(&of_row) {
+                    *weight = if *weight > 0.0 { *new } else { 0.0 };
+                }
+            }
+        }
+        (Some(all), weights)
     }
 
     fn check(&self, what: &'static str, found: &[usize], expected: &[usize]) -> Result<()> {

@@ -260,10 +260,7 @@ impl Judge<'_> {
         let fixed = stage.prior.sigma().is_none();
         let norm = self.hold_out.norm(self.y);
         let mut trial = Trial::new(stage.clone());
-        let measure = |frames: ArrayView3<'_, f32>, is_last: bool| {
-            if fixed && !is_last {
-                return ControlFlow::Continue(());
-            }
+        let measure = |frames: ArrayView3<'_, f32>| {
             let squares = self.hold_out.residuals(self.op, self.y, frames);
             let done = trial.errors.len() + 1;
             let rivals = rival.filter(|_| !fixed).and_then(|rival| rival.squares.get(done - 1));

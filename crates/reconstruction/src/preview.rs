@@ -7,7 +7,7 @@
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, s};
 
-use super::error::{ReconError, Result, shape_text};
+use super::error::{Result, check_shape, shape_text};
 use super::operator::SensingOperator;
 use super::priors::tv::TotalVariation;
 use super::schedule::Schedule;
@@ -85,13 +85,10 @@ impl Blocks {
         y: ArrayView2<'_, f32>,
     ) -> Result<Array2<f32>> {
         let (frames, height, width) = masks.dim();
-        if y.dim() != (height, width) || frames != self.frames || height > self.side {
-            return Err(ReconError::Shape {
-                what: "a row of blocks",
-                found: format!("{} and {}", shape_text(masks.shape()), shape_text(y.shape())),
-                expected: format!("{} masks of at most {} rows", self.frames, self.side),
-            });
-        }
+        let fits = y.dim() == (height, width) && frames == self.frames && height <= self.side;
+        let found = format!("{} and {}", shape_text(masks.shape()), shape_text(y.shape()));
+        let expected = format!("{} masks of at most {} rows", self.frames, self.side);
+        check_shape(fits, "a row of blocks", found, expected)?;
         let mut row = Array2::zeros((frames, width.div_ceil(self.side)));
         for (index, mut out) in row.columns_mut().into_iter().enumerate() {
             let columns = index * self.side..width.min((index + 1) * self.side);

@@ -2,7 +2,7 @@
 
 use ndarray::{Array2, ArrayView2};
 
-use super::error::{ReconError, Result, shape_text};
+use super::error::{ReconError, Result, check_parameter, check_shape, shape_text};
 
 /// Share of the pixels that lie at or below the white level.
 const WHITE_QUANTILE: f64 = 0.995;
@@ -29,13 +29,8 @@ impl ScaleEstimator {
     /// # Errors
     /// Sizes that differ, or a measurement without light. NaN were not measured.
     pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
-        if y.dim() != self.light.dim() {
-            return Err(ReconError::Shape {
-                what: "the measurement",
-                found: shape_text(y.shape()),
-                expected: shape_text(self.light.shape()),
-            });
-        }
+        let (found, expected) = (shape_text(y.shape()), shape_text(self.light.shape()));
+        check_shape(y.dim() == self.light.dim(), "the measurement", found, expected)?;
         // Pixels with little light have a ratio of noise to almost nothing.
         let floor = 0.25 * self.light.mean().unwrap_or(0.0);
         let is_lit = |&(y, light): &(&f32, &f32)| *light > floor && !y.is_nan();
@@ -46,14 +41,10 @@ impl ScaleEstimator {
         }
         let index = ((ratios.len() - 1) as f64 * WHITE_QUANTILE).round() as usize;
         let (_, &mut white, _) = ratios.select_nth_unstable_by(index, f32::total_cmp);
-        if white.is_finite() && white > 0.0 {
-            return Ok(white);
-        }
-        Err(ReconError::Parameter {
-            name: "the measurement's white level".into(),
-            value: white.to_string(),
-            range: "above 0: the measurement holds no light (is the dark frame too bright?)".into(),
-        })
+        let is_lit = white.is_finite() && white > 0.0;
+        let range = "above 0: the measurement holds no light (is the dark frame too bright?)";
+        check_parameter(is_lit, "the measurement's white level", white, range)?;
+        Ok(white)
     }
 }
 

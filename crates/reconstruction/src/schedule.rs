@@ -12,6 +12,8 @@ use serde_json::Value;
 use super::bounds::{self, Fault};
 use super::error::{ReconError, Result};
 use super::priors::Network;
+use super::priors::network::{FastdvdnetInt8Spec, FastdvdnetSpec};
+use super::priors::registry::PriorSpec;
 use super::stage::Stage;
 
 /// The stages of the solver, one after the other. Algorithm 1 of the paper has two.
@@ -134,6 +136,17 @@ impl Schedule {
     /// True if a result frame depends on its neighbours in time. Only then does it help to reconstruct snapshots together.
     pub fn looks_along_time(&self) -> bool {
         self.stages.iter().any(|stage| stage.prior.looks_along_time())
+    }
+
+    /// Replaces networks of 8 bits, which are faster on a CPU only, by those of 32 bits.
+    #[must_use]
+    pub fn with_float_networks(mut self) -> Self {
+        for stage in &mut self.stages {
+            if let PriorSpec::FastdvdnetInt8(FastdvdnetInt8Spec { sigma }) = stage.prior {
+                stage.prior = PriorSpec::Fastdvdnet(FastdvdnetSpec { sigma });
+            }
+        }
+        self
     }
 
     /// Fixes the total number of iterations and switches convergence tests, adaptation and static regions off: earlier

@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use super::error::{ReconError, Result};
+use super::error::{Result, check_parameter};
 use super::tile::{parts, weights};
 
 /// The runs of a sequence. They depend on the number of snapshots and the parameters alone, never on the number of
@@ -50,22 +50,11 @@ impl SequencePlan {
     /// # Errors
     /// A length of 0, or an overlap that is not below it.
     pub fn new(snapshots: Range<usize>, length: usize, overlap: usize) -> Result<Self> {
-        if snapshots.is_empty() || length == 0 {
-            return Err(ReconError::Parameter {
-                name: "the length of a run".into(),
-                value: length.min(snapshots.len()).to_string(),
-                range: "at least 1 snapshot".into(),
-            });
-        }
-        if overlap >= length {
-            return Err(ReconError::Parameter {
-                name: "the overlap of runs".into(),
-                value: overlap.to_string(),
-                range: "less than the length of a run".into(),
-            });
-        }
-        let first = snapshots.start;
-        let length = length.min(snapshots.len());
+        let (first, available) = (snapshots.start, length.min(snapshots.len()));
+        check_parameter(available > 0, "the length of a run", available, "at least 1 snapshot")?;
+        let range = "less than the length of a run";
+        check_parameter(overlap < length, "the overlap of runs", overlap, range)?;
+        let length = available;
         let runs = parts(snapshots.len(), length, overlap.min(length - 1), 1);
         Ok(Self { runs: runs.into_iter().map(|run| first + run.start..first + run.end).collect() })
     }

@@ -6,7 +6,7 @@ use ndarray::{Array3, Array4, ArrayView3};
 use strum::Display;
 
 use super::assessment::{self, Evidence};
-use super::error::{ReconError, Result, shape_text};
+use super::error::{Result, check_shape, shape_text};
 use super::gap::{Solver, run_stage};
 use super::operator::SensingOperator;
 use super::priors::Networks;
@@ -55,7 +55,7 @@ pub struct Outcome {
 /// Starts from 0. Networks are requested when a stage needs them.
 ///
 /// # Errors
-/// Sizes that disagree, an invalid schedule, a missing or failing network, divergence, or [`ReconError::Cancelled`] when
+/// Sizes that disagree, an invalid schedule, a missing or failing network, divergence, or [`super::ReconError::Cancelled`] when
 /// the observer asks for it.
 pub fn reconstruct(
     op: &SensingOperator,
@@ -114,14 +114,10 @@ pub(crate) fn run_stages(
     mut after: impl FnMut(usize, &Array3<f32>, Option<Array3<f32>>),
 ) -> Result<Outcome> {
     schedule.validate()?;
-    if y.dim() != op.measurement_dim() {
-        let (snapshots, height, width) = op.measurement_dim();
-        return Err(ReconError::Shape {
-            what: "the measurement",
-            found: shape_text(y.shape()),
-            expected: format!("{} (the masks' size)", shape_text(&[snapshots, height, width])),
-        });
-    }
+    let (snapshots, height, width) = op.measurement_dim();
+    let expected = format!("{} (the masks' size)", shape_text(&[snapshots, height, width]));
+    let fits = y.dim() == op.measurement_dim();
+    check_shape(fits, "the measurement", shape_text(y.shape()), expected)?;
     // Before anything is computed, so that a missing network is reported at once.
     schedule.networks().into_iter().try_for_each(|which| networks.network(which).map(|_| ()))?;
     let measured = Measured::new(op, y);
@@ -156,7 +152,7 @@ fn run_once(
     stage: &Stage,
     observer: &mut dyn Observer,
 ) -> Result<bool> {
-    run_stage(solver, (index, stage), observer, |_, _| ControlFlow::Continue(()))
+    run_stage(solver, (index, stage), observer, |_| ControlFlow::Continue(()))
 }
 
 /// Runs a stage with weak, and again with strong temporal shrinkage from the same start, and blends the weakly shrunk frames

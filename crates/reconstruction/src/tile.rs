@@ -5,7 +5,7 @@ use std::ops::Range;
 use ndarray::{Array2, ArrayView2, ArrayViewMut2, s};
 use serde::{Deserialize, Serialize};
 
-use super::error::{ReconError, Result};
+use super::error::{Result, check_parameter, check_shape};
 
 /// A window of a picture: all pixels of some rows and columns, or every second one, as for one colour of a mosaic.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -112,27 +112,12 @@ impl TilePlan {
     /// # Errors
     /// `size` below 16 or above 8192, or `overlap` above half of `size`.
     pub fn new(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
-        if height == 0 || width == 0 {
-            return Err(ReconError::Shape {
-                what: "a picture to be tiled",
-                found: format!("{height}x{width}"),
-                expected: "at least one pixel".into(),
-            });
-        }
-        if !(16..=8192).contains(&size) {
-            return Err(ReconError::Parameter {
-                name: "tile size".into(),
-                value: size.to_string(),
-                range: "from 16 to 8192 pixels".into(),
-            });
-        }
-        if overlap * 2 > size {
-            return Err(ReconError::Parameter {
-                name: "tile overlap".into(),
-                value: overlap.to_string(),
-                range: "at most half of the tile size".into(),
-            });
-        }
+        let picture = format!("{height}x{width}");
+        check_shape(height * width > 0, "a picture to be tiled", picture, "at least one pixel")?;
+        let sizes = 16..=8192;
+        check_parameter(sizes.contains(&size), "tile size", size, "from 16 to 8192 pixels")?;
+        let range = "at most half of the tile size";
+        check_parameter(overlap * 2 <= size, "tile overlap", overlap, range)?;
         let (rows, columns) = (spans(height, size, overlap), spans(width, size, overlap));
         Ok(Self { height, width, size, overlap, step: 1, rows, columns })
     }
@@ -143,13 +128,8 @@ impl TilePlan {
     /// # Errors
     /// As [`Self::new`]; an odd side.
     pub fn of_mosaic(height: usize, width: usize, size: usize, overlap: usize) -> Result<Self> {
-        if !height.is_multiple_of(2) || !width.is_multiple_of(2) {
-            return Err(ReconError::Shape {
-                what: "a mosaic",
-                found: format!("{height}x{width}"),
-                expected: "an even number of rows and columns".into(),
-            });
-        }
+        let (is_even, found) = (height % 2 + width % 2 == 0, format!("{height}x{width}"));
+        check_shape(is_even, "a mosaic", found, "an even number of rows and columns")?;
         let plane = Self::new(height / 2, width / 2, size, overlap)?;
         Ok(Self { height, width, step: 2, ..plane })
     }

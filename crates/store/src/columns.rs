@@ -238,9 +238,7 @@ impl<T: DeserializeOwned> FromColumn for Json<T> {
 /// Reads columns of a row.
 pub trait Columns {
     /// The column of this name.
-    ///
-    /// # Errors
-    /// [`StoreError::Corrupt`] if its value is none of this type.
+    /// Errors: [`StoreError::Corrupt`] if its value is none of this type.
     fn read<T: FromColumn>(&self, column: &'static str) -> Result<T>;
 
     /// The column as JSON; none where it is NULL.

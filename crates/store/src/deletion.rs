@@ -45,9 +45,7 @@ impl Store {
     }
 
     /// Removes the files whose rows are deleted.
-    ///
-    /// # Errors
-    /// The first failure; the other files are removed nevertheless.
+    /// Errors: the first failure; the other files are removed nevertheless.
     pub async fn finish_removals(&self) -> Result<()> {
         let mut last = (String::new(), String::new());
         let mut failure = None;

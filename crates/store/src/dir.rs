@@ -2,12 +2,14 @@
 
 use std::fs::{self, File, TryLockError};
 use std::io;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use rustix::fs::FallocateFlags;
 
+use super::database_file::DatabaseFiles;
 use super::error::{Result, StoreError};
 use super::locked::LockedFile;
 use engine::job::{JobId, PartialId, Sha256};
@@ -127,13 +129,45 @@ impl DataDir {
 
     /// Takes the lock of the server. Each folder has one.
     pub(crate) fn lock_server(&self) -> Result<LockedFile> {
-        let path = self.root.join("server.lock");
-        let file = File::create(&path).map_err(StoreError::io("make", &path))?;
-        match LockedFile::take(file) {
+        let path = self.server_lock();
+        // The file of a running server keeps what that server has recorded.
+        let mut options = File::options();
+        let file = options.create(true).truncate(false).write(true).open(&path);
+        match LockedFile::take(file.map_err(StoreError::io("make", &path))?) {
             Ok(file) => Ok(file),
             Err(TryLockError::WouldBlock) => Err(StoreError::Taken(self.root.to_path_buf())),
             Err(TryLockError::Error(error)) => Err(StoreError::io("lock", &path)(error)),
         }
+    }
+
+    fn server_lock(&self) -> PathBuf {
+        self.root.join("server.lock")
+    }
+
+    /// Records the files of the open database, for [`Self::check_files_of_server`].
+    pub(crate) fn record_files(&self, mut lock: &File, files: &DatabaseFiles) -> Result<()> {
+        let text = serde_json::to_vec(files).map_err(io::Error::from);
+        let recorded = text.and_then(|text| {
+            lock.set_len(0)?;
+            lock.write_all(&text)
+        });
+        recorded.map_err(StoreError::io("write", &self.server_lock()))
+    }
+
+    /// Errors: [`StoreError::DatabaseGone`] if a server runs on this folder and uses other files than the present ones.
+    pub(crate) fn check_files_of_server(&self) -> Result<()> {
+        let path = self.server_lock();
+        let file = match File::open(&path) {
+            Ok(file) => file,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(error) => return Err(StoreError::io("open", &path)(error)),
+        };
+        if !matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)) {
+            return Ok(());
+        }
+        // A server that is just starting has not recorded its files.
+        let Ok(files) = serde_json::from_reader::<_, DatabaseFiles>(file) else { return Ok(()) };
+        files.check(&self.database())
     }
 
     /// Removes what dead processes left in `tmp`: whatever nobody holds the lock of. Says how much.

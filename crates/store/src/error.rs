@@ -5,11 +5,19 @@ use std::path::{Path, PathBuf};
 use engine::job::IllegalTransition;
 use formats::DiskTrouble;
 
+/// Result codes of SQLite.
+const BUSY: u32 = 5;
+const LOCKED: u32 = 6;
+const READ_ONLY: u32 = 8;
+const DAMAGED: u32 = 11;
+const FULL: u32 = 13;
+const NO_DATABASE: u32 = 26;
+
 pub type Result<T, E = StoreError> = std::result::Result<T, E>;
 
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    #[error("the database failed: {0}")]
+    #[error("{}", database_failure(.0))]
     Database(#[from] sqlx::Error),
     #[error("the database can't be brought up to date: {0}")]
     Migrate(#[from] sqlx::migrate::MigrateError),
@@ -51,23 +59,19 @@ pub enum StoreError {
     Refused { folder: PathBuf, found: String, remedy: &'static str },
     /// Changes of the open database would be lost.
     #[error(
-        "{path} was removed or replaced while the service runs, so nothing is changed: stop the service, and put the \
-         database back with its -wal file, or serve a backup",
+        "{path} was removed, replaced or truncated while the service runs, so nothing is changed: stop the service, \
+         and put the database back with its -wal file, or serve a backup",
         path = .0.display()
     )]
     DatabaseGone(PathBuf),
     #[error("there is no {what} {id}")]
     NotFound { what: &'static str, id: String },
-    #[error("{}", unready(*.id, .error.as_deref()))]
-    Unready {
-        id: engine::job::CalibrationId,
-        /// Why there will be none; none while they are made.
-        error: Option<String>,
-    },
-    #[error("{}", unchecked(*.id, .error.as_deref()))]
-    Unchecked {
-        id: engine::job::MeasurementId,
-        /// Why it did not pass; none while the check goes on.
+    #[error("{what} {id} {}", not_ready(.error.as_deref()))]
+    NotReady {
+        /// A calibration or a measurement.
+        what: &'static str,
+        id: String,
+        /// Why it did not pass its check; none while it is checked or made.
         error: Option<String>,
     },
     #[error("the {what} is used by {users} {by}; delete those first")]
@@ -128,21 +132,30 @@ pub enum StoreError {
     Interrupted,
 }
 
-fn unready(id: engine::job::CalibrationId, error: Option<&str>) -> String {
-    match error {
-        None => {
-            format!(
-                "the masks of calibration {id} are still being made or checked; ask again in a moment"
-            )
+/// The primary code of SQLite, whose reason is in the upper bits.
+fn sqlite_code(error: &sqlx::Error) -> Option<u32> {
+    let sqlx::Error::Database(error) = error else { return None };
+    Some(error.code()?.parse::<u32>().ok()? & 0xff)
+}
+
+fn database_failure(error: &sqlx::Error) -> String {
+    match sqlite_code(error) {
+        Some(DAMAGED | NO_DATABASE) => format!(
+            "the database is damaged ({error}): stop the service and serve a backup (docs/OPERATIONS.md, section \
+             Back up and restore)"
+        ),
+        Some(FULL) => {
+            "the disk is full, so the database can't be changed: delete jobs or other files"
+                .to_owned()
         }
-        Some(error) => format!("calibration {id} has failed: {error}"),
+        _ => format!("the database failed: {error}"),
     }
 }
 
-fn unchecked(id: engine::job::MeasurementId, error: Option<&str>) -> String {
+fn not_ready(error: Option<&str>) -> String {
     match error {
-        None => format!("measurement {id} is still being checked; ask again in a moment"),
-        Some(error) => format!("measurement {id} has not passed its check: {error}"),
+        None => "is still being made or checked; ask again in a moment".to_owned(),
+        Some(error) => format!("has failed: {error}"),
     }
 }
 
@@ -161,14 +174,15 @@ impl StoreError {
     /// True if others had the database for too long.
     pub fn is_busy(&self) -> bool {
         match self {
-            // SQLITE_BUSY and SQLITE_LOCKED, which may come with a reason in the upper bits
-            Self::Database(sqlx::Error::Database(error)) => error
-                .code()
-                .and_then(|code| code.parse::<u32>().ok())
-                .is_some_and(|code| matches!(code & 0xff, 5 | 6)),
             Self::Database(sqlx::Error::PoolTimedOut) => true,
+            Self::Database(error) => matches!(sqlite_code(error), Some(BUSY | LOCKED)),
             _ => false,
         }
+    }
+
+    /// True if SQLite has found damage in the database.
+    pub fn is_damage(&self) -> bool {
+        matches!(self, Self::Database(error) if matches!(sqlite_code(error), Some(DAMAGED | NO_DATABASE)))
     }
 
     /// The state of the disk that is the cause, if it is.
@@ -177,11 +191,10 @@ impl StoreError {
             Self::Io { source, .. } => DiskTrouble::of(source),
             Self::Database(sqlx::Error::Database(error)) => {
                 match error.code()?.parse::<u32>().ok()? {
-                    // SQLITE_FULL
-                    13 => Some(DiskTrouble::Full),
-                    // SQLITE_READONLY, whose reason is in the upper bits, and the errors of SQLite for a write
-                    // (SQLITE_IOERR_WRITE) or a sync (SQLITE_IOERR_FSYNC) that a read-only file system refuses
-                    code if code & 0xff == 8 || matches!(code, 778 | 1034) => {
+                    FULL => Some(DiskTrouble::Full),
+                    // The last two are the errors of SQLite for a write (SQLITE_IOERR_WRITE) or a sync
+                    // (SQLITE_IOERR_FSYNC) that a read-only file system refuses.
+                    code if code & 0xff == READ_ONLY || matches!(code, 778 | 1034) => {
                         Some(DiskTrouble::ReadOnly)
                     }
                     _ => None,

@@ -56,21 +56,20 @@ pub use integrity::Audit;
 pub use locked::LockedFile;
 use migrations::Schema;
 pub use queue::{
-    Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, Claimant, ClaimedTask, Completion,
-    Estimate, Heartbeat, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED,
-    MessagePlace, Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work,
-    WorkerEnd,
+    Begun, CalibrationDone, CalibrationTask, CheckTask, Checked, ClaimedTask, Completion, Estimate,
+    Heartbeat, JobProgress, JobTask, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, MessagePlace,
+    Movie, MovieWork, Product, ProgressStage, RemoteBeat, RemoteTask, Work, WorkerEnd,
 };
 pub use rows::{Expired, Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Asked, Blob, BlobRow, Calibration, Change, Changes, Delivery, Entitlement, FIRST_RESERVE,
-    FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter, LabFigures,
-    LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel, NewPartial,
-    Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations, TaskCounts,
-    TaskRecord, TaskTotals, TileHistory, TileResult, TileState, Token, WorkerPlace, WorkerRow,
-    WorkerTakes, WorkerTask, share_error,
+    Asked, Blob, BlobRow, Calibration, Change, Changes, Claimant, Delivery, Entitlement,
+    FIRST_RESERVE, FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter,
+    LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel,
+    NewPartial, Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations,
+    Resource, TaskCounts, TaskRecord, TaskTotals, Thing, TileHistory, TileResult, TileState, Token,
+    WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 
@@ -114,6 +113,9 @@ impl Store {
         if serves && dir.is_full()? {
             dir.give_up_reserve()?;
         }
+        if !serves {
+            dir.check_files_of_server()?;
+        }
         identity::check(&dir, purpose, schema.newest()).await?;
         dir.fill()?;
         let copy = if serves { upgrade::save(&dir, schema.newest()).await? } else { None };
@@ -134,7 +136,8 @@ impl Store {
         let writer = SqlitePoolOptions::new()
             .max_connections(1)
             .idle_timeout(None)
-            .max_lifetime(None)
+            // SQLite opens a file read-only if it can't be written at this moment, and the connection stays so.
+            .max_lifetime(Duration::from_secs(60))
             // After some errors, such as a full disk, SQLite has rolled back already. sqlx then fails to roll back
             // again and takes the transaction for open.
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
@@ -154,6 +157,9 @@ impl Store {
             .connect_with(options.read_only(true))
             .await?;
         let files = database_file::DatabaseFiles::open(&dir.database())?;
+        if let Some(lock) = &server {
+            dir.record_files(lock, &files)?;
+        }
         let store = Self {
             dir,
             writer,
@@ -234,8 +240,12 @@ impl Store {
         self.damage.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Tries whether files can be made and written.
+    /// Tries whether the database can be changed, and files can be made and written.
     pub async fn try_disk(&self) -> Result<()> {
+        match self.try_change().await {
+            Err(error) if !error.is_busy() => return Err(error),
+            _ => {}
+        }
         let (store, byte) = (self.clone(), b"?");
         on_files(move || {
             let mut file = store.blob_writer()?;
@@ -247,7 +257,13 @@ impl Store {
         .await
     }
 
-    /// Errors: [`StoreError::DatabaseGone`] if the file of the database was removed or replaced since it was opened.
+    async fn try_change(&self) -> Result<()> {
+        let mut transaction = self.write().await?;
+        sql!("UPDATE folder SET generation = generation").execute(&mut *transaction).await?;
+        Ok(transaction.rollback().await?)
+    }
+
+    /// Errors: [`StoreError::DatabaseGone`] if a file of the database was removed, replaced or truncated since it was opened.
     pub fn check_database_file(&self) -> Result<()> {
         self.files.check(&self.dir.database())
     }

@@ -12,18 +12,14 @@ pub struct LockedFile(File);
 
 impl LockedFile {
     /// Waits for the lock.
-    ///
-    /// # Errors
-    /// If the file system knows no locks.
+    /// Errors: the file system knows no locks.
     pub fn wait(file: File) -> io::Result<Self> {
         file.lock()?;
         Ok(Self(file))
     }
 
     /// Takes the lock if nobody has it.
-    ///
-    /// # Errors
-    /// [`TryLockError::WouldBlock`] if another has it.
+    /// Errors: [`TryLockError::WouldBlock`] if another has it.
     pub fn take(file: File) -> Result<Self, TryLockError> {
         file.try_lock()?;
         Ok(Self(file))

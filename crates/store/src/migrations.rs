@@ -42,9 +42,7 @@ impl Schema {
     }
 
     /// Applies the migrations that a database lacks.
-    ///
-    /// # Errors
-    /// If the database has a migration that is not part of this schema, or one fails.
+    /// Errors: the database has a migration that is not part of this schema, or one fails.
     pub async fn apply(&self, database: &SqlitePool) -> Result<(), MigrateError> {
         self.0.run(database).await
     }

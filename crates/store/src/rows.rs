@@ -5,7 +5,7 @@ use sqlx::sqlite::SqliteRow;
 
 use super::error::{Result, StoreError};
 use crate::columns::{Columns, FromColumn, FromRow, sql, sql_as};
-use engine::job::{CalibrationId, Lab, MeasurementId, ModelId, Sha256, ThingId, Timestamp};
+use engine::job::{CalibrationId, Lab, MeasurementId, ModelId, Sha256, Timestamp};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -62,48 +62,6 @@ impl<Id> Default for Filter<Id> {
     }
 }
 
-/// The text of `listed!`.
-macro_rules! listed_text {
-    ($place:expr) => {
-        concat!(
-            "SELECT * FROM ",
-            $place,
-            " lab = ?1 AND id < coalesce(?2, 'g')
-               AND (?3 IS NULL OR calibration = ?3)
-               AND (?5 IS NULL OR created_at >= ?5) AND (?6 IS NULL OR created_at < ?6)
-             ORDER BY id DESC LIMIT ?4"
-        )
-    };
-}
-
-impl<Id: Into<ThingId>> Filter<Id> {
-    /// Drops the kind of the things from the filter.
-    pub(super) fn untyped(self) -> Filter<ThingId> {
-        let Self { calibration, created, after } = self;
-        Filter { calibration, created, after: after.map(Into::into) }
-    }
-}
-
-/// A page of things of a lab that belong to calibrations, newest first, with one item more than the page shows, by
-/// `sql!` or `sql_as!`. The table is followed by WHERE and the conditions that it adds.
-macro_rules! listed {
-    ($statement:ident, $place:expr, $lab:expr, $filter:expr, $limit:expr) => {
-        $statement!(
-            $crate::rows::listed_text!($place),
-            [
-                $lab,
-                $filter.after,
-                $filter.calibration,
-                i64::from($limit) + 1,
-                $filter.created.from,
-                $filter.created.before
-            ]
-        )
-    };
-}
-
-pub(super) use {listed, listed_text};
-
 /// A reference of a new row.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Reference {
@@ -112,6 +70,8 @@ pub(super) enum Reference {
     Measurement(MeasurementId),
     Model(ModelId),
 }
+
+const THING: &str = "SELECT 1 FROM requests WHERE id = ? AND facts IS NOT NULL";
 
 /// Refuses a row with a missing reference: it may have been deleted a moment ago. SQLite would refuse it too, but does
 /// not say which of its references is broken. The writer's lock keeps others from deleting it afterwards.
@@ -122,13 +82,9 @@ pub(super) async fn require(
     for reference in references {
         let (what, query, id) = match reference {
             Reference::Blob(id) => ("blob", "SELECT 1 FROM blobs WHERE sha256 = ?", id.to_string()),
-            Reference::Calibration(id) => {
-                ("calibration", "SELECT 1 FROM calibrations WHERE id = ?", id.to_string())
-            }
-            Reference::Measurement(id) => {
-                ("measurement", "SELECT 1 FROM measurements WHERE id = ?", id.to_string())
-            }
-            Reference::Model(id) => ("model", "SELECT 1 FROM models WHERE id = ?", id.to_string()),
+            Reference::Calibration(id) => ("calibration", THING, id.to_string()),
+            Reference::Measurement(id) => ("measurement", THING, id.to_string()),
+            Reference::Model(id) => ("model", THING, id.to_string()),
         };
         let found = sql!(query, [id.as_str()]).fetch_optional(&mut *connection).await?;
         found.ok_or(StoreError::NotFound { what, id })?;

@@ -6,6 +6,7 @@ mod failures;
 mod keeping;
 mod migration;
 mod movies;
+mod notifications;
 mod remote;
 mod sequences;
 mod statements;
@@ -20,9 +21,9 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 
 use super::{
-    Checked, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration, NewJob,
-    NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError, Work,
-    WorkerEnd, WorkerPlace, WorkerTakes,
+    Checked, Claimant, ClaimedTask, Completion, Heartbeat, Inserted, JobTask, NewCalibration,
+    NewJob, NewMeasurement, NewRequest, Product, Purpose, RequestKey, StagedDir, Store, StoreError,
+    Work, WorkerEnd, WorkerPlace,
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
@@ -68,7 +69,6 @@ impl Lab {
         let (masks, _) = store.store_upload(&local, None, upload(b"masks")).await.unwrap();
         let (data, _) = store.store_upload(&local, None, upload(b"data")).await.unwrap();
         let facts = NewCalibration {
-            name: None,
             masks: masks.sha256,
             format: "npy".into(),
             sample: "float32".into(),
@@ -86,12 +86,11 @@ impl Lab {
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();
-        store.worker_started(worker, 1, &WorkerPlace::default(), WorkerTakes::All).await.unwrap();
+        store.worker_started(worker, 1, &WorkerPlace::default(), Claimant::Local).await.unwrap();
         let asked = Submission::Calibration(asked);
         let passed = Checked::Masks(facts, upload(b"prepared masks"));
         let calibration = make(&store, worker, asked, passed).await;
         let facts = NewMeasurement {
-            name: None,
             calibration,
             data: data.sha256,
             format: "npy".into(),

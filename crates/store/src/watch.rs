@@ -24,9 +24,7 @@ pub struct Watcher {
 
 impl Store {
     /// A watcher of this store.
-    ///
-    /// # Errors
-    /// If the kernel allows no further watcher.
+    /// Errors: the kernel allows no further watcher.
     pub fn watcher(&self) -> io::Result<Watcher> {
         let inotify = Inotify::init()?;
         // The folder, since SQLite makes and removes its files. Blobs and results are in other folders.
@@ -37,9 +35,7 @@ impl Store {
 
 impl Watcher {
     /// Waits until there may be a change since the last call, at most for `time`.
-    ///
-    /// # Errors
-    /// If the kernel's queue can't be read.
+    /// Errors: the kernel's queue can't be read.
     pub async fn changed(&mut self, time: Duration) -> io::Result<()> {
         let echo = self.written.is_some_and(|written| written.elapsed() < ECHO);
         let time = if echo { time.min(LOOK) } else { time };

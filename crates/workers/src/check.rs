@@ -21,7 +21,9 @@ use engine::pipeline::progress::Monitor;
 use engine::pipeline::registration;
 use formats::mat::SceneArray;
 use formats::{FormatError, Limits, Part, StackInfo, StackWriter, planar};
-use store::{BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, StoreError};
+use store::{
+    BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, NewModel, StoreError,
+};
 
 /// Why a check did not pass.
 enum CheckError {
@@ -81,7 +83,7 @@ pub(super) fn check(
         (Submission::Calibration(request), _) => match (&request.captures, request.registration_of)
         {
             (Some(captures), _) => running.captures(captures, request),
-            (None, Some(_)) => running.corrected(request),
+            (None, Some(_)) => running.corrected(),
             (None, None) => running.masks(request),
         },
         (Submission::Measurement(request), Some(masks)) => running.measurement(request, masks),
@@ -181,22 +183,12 @@ impl Running<'_> {
 
     /// Checks masks and writes them on \[0,1\].
     fn masks(&self, request: &CalibrationRequest) -> Result<Checked> {
-        let CalibrationRequest {
-            name,
-            array,
-            axes,
-            crop,
-            frames,
-            packing,
-            full_scale,
-            mosaic,
-            dispersion,
-            ..
-        } = request.clone();
+        let CalibrationRequest { array, axes, crop, frames, packing, mosaic, dispersion, .. } =
+            request.clone();
         let wrong = || Refusal::new(RefusalCode::InvalidRequest, "name the masks").at("/masks");
         let masks = request.masks.ok_or_else(wrong)?;
         let file = self.upload(masks, "/masks")?;
-        let source = Source::upload(&file, SceneArray::Masks, full_scale, self.limits())
+        let source = Source::upload(&file, SceneArray::Masks, request.full_scale, self.limits())
             .named(array.map(|name| name.to_string()))
             .arranged(axes, None)
             .part(Part { crop, frames }, packing)
@@ -213,7 +205,6 @@ impl Running<'_> {
         })?;
         check_mosaic(mosaic, (info.height, info.width))?;
         let facts = NewCalibration {
-            name,
             masks,
             format: info.format.to_string(),
             sample: info.sample.to_string(),
@@ -233,7 +224,7 @@ impl Running<'_> {
     }
 
     /// Writes masks as the registration of a job has corrected them.
-    fn corrected(&self, request: &CalibrationRequest) -> Result<Checked> {
+    fn corrected(&self) -> Result<Checked> {
         let task = &self.check.task;
         let correction = task.registered.as_ref().and_then(Registered::correction);
         let (Some(calibration), Some(correction)) = (&task.calibration, correction) else {
@@ -256,7 +247,6 @@ impl Running<'_> {
             })?;
         let masks = writer.finish()?.finish()?;
         let facts = NewCalibration {
-            name: request.name.clone(),
             masks: masks.sha256(),
             format: "registration".into(),
             sample: info.sample.to_string(),
@@ -339,7 +329,6 @@ impl Running<'_> {
             None => Sequence::from_camera(request.camera_fps, request.exposure_s, masks.frames),
         };
         let facts = NewMeasurement {
-            name: request.name,
             calibration: request.calibration,
             data: request.data,
             format: info.format.to_string(),
@@ -369,7 +358,9 @@ impl Running<'_> {
     ) -> Result<Checked> {
         let file = self.upload(request.file, "/file")?;
         let facts = model_check::run(command, &file, &masks.facts, self.deadline, self.monitor);
-        Ok(Checked::Model(facts.map_err(CheckError::Failed)??))
+        let facts = facts.map_err(CheckError::Failed)??;
+        let ModelRequest { calibration, file, .. } = *request;
+        Ok(Checked::Model(NewModel { calibration, file, facts }))
     }
 }
 

@@ -184,8 +184,8 @@ impl Local {
 impl Transport for Local {
     async fn started(&self) -> Result<(), TransportError> {
         let location = WorkerPlace { device: Some(self.device.clone()), ..WorkerPlace::default() };
-        let takes = self.claimant.takes();
-        Ok(self.store.worker_started(self.worker, std::process::id(), &location, takes).await?)
+        let (worker, pid) = (self.worker, std::process::id());
+        Ok(self.store.worker_started(worker, pid, &location, self.claimant).await?)
     }
 
     async fn report_alive(&self) -> Result<(), TransportError> {

@@ -169,8 +169,6 @@ fn calibration(
 fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
     let report = &calibrated.report.report;
     NewCalibration {
-        // The store takes the name and the mosaic from the request.
-        name: None,
         masks,
         format: "captures".into(),
         sample: calibrated.sample.to_string(),
@@ -182,6 +180,7 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
         mask_mean: report.masks.mean,
         dead_pixels: report.masks.dead_pixels,
         clipped_negatives: calibrated.clipped_negatives,
+        // The store takes it from the request.
         mosaic: None,
         reading: None,
         dispersion: None,
@@ -288,9 +287,10 @@ fn tile(
     let cost = CostRecord {
         provider: uses_network.then(|| match task.model {
             Some(_) => model_provider.into(),
-            None => source.provider().into(),
+            None => source.provider(&task.schedule).into(),
         }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
+        gpu: source.gpu_name(&task.schedule),
         cpu_seconds: cpu_seconds() - before + process_seconds,
         peak_rss_bytes: peak_rss_bytes() + process_peak,
     };

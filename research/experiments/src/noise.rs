@@ -90,8 +90,9 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
     let &Arguments { algorithm, seed, ref sigmas, .. } = arguments;
     let frames = usize::from(arguments.cr);
     let clips = read_clips(&arguments.clips, frames, arguments.scale)?;
-    let schedule = algorithm.default_schedule();
-    let bench = Bench { schedule, network: arguments.engine.network()?, sigmas, seed };
+    let network = arguments.engine.network()?;
+    let schedule = network.suited(algorithm.default_schedule());
+    let bench = Bench { schedule, network, sigmas, seed };
     let grid = ApertureGrid::for_frames(frames);
     let mut rng = generator(seed);
     let draw = Draw::of(grid.count() / 2);

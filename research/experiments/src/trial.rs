@@ -6,7 +6,7 @@ use std::time::Instant;
 use engine::job::{Algorithm, RunSpec, Sequence};
 use engine::pipeline::networks::{ModelRecord, NetworkSource};
 use engine::pipeline::quality::FrameQuality;
-use engine::pipeline::records::{PilotRecord, Summary, TileRecord};
+use engine::pipeline::records::{PilotRecord, TileRecord};
 use engine::pipeline::scale::white;
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::cpu_seconds;
@@ -157,7 +157,7 @@ impl Bench {
         sequence: Choice,
     ) -> Result<Key, CliError> {
         let (compression_ratio, scale, _) = measured.masks.dim();
-        let schedule = algorithm.default_schedule();
+        let schedule = self.network.suited(algorithm.default_schedule());
         let learned = self.learned.as_ref().filter(|_| algorithm == Algorithm::Learned);
         let snapshots = measured.measurement.dim().0;
         let kind = match sequence {
@@ -185,7 +185,7 @@ impl Bench {
             inputs_sha256: measured.sha256.clone(),
             tile: cut.tile,
             models,
-            provider: deep.then(|| self.network.provider().into()),
+            provider: deep.then(|| self.network.provider(&schedule).into()),
             schedule,
         })
     }
@@ -221,7 +221,7 @@ impl Bench {
         let frame = |k| solved.frame(&input, k / frames, k % frames);
         let quality = Quality::of(&plan, frame, &measured.truth)?;
         let tiles = solved.runs.iter().flatten().map(TileRecord::from).collect::<Vec<_>>();
-        let summary = Summary::of(&tiles);
+        let summary = TileRecord::summary(&tiles);
         let joints = solved.pilot.map(|pilot| pilot.joints).unwrap_or_default();
         Ok(Row {
             key,

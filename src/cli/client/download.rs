@@ -145,7 +145,7 @@ fn is_same(path: &Path, size: u64, sha256: Option<Sha256>) -> Result<Fetched, Cl
 
 fn name_in_use(path: &Path) -> CliError {
     CliError::Input(format!(
-        "{} exists and is a different file; it is not overwritten",
+        "{} exists and is a different file; it is not overwritten: choose another folder with --out",
         path.display()
     ))
 }

@@ -12,6 +12,7 @@ use uuid::Uuid;
 
 use super::{Client, ClientError, Result, refusal, wait_to_retry};
 use crate::cli::CliError;
+use crate::cli::error::open_input;
 use engine::job::Sha256;
 
 /// Bytes of a piece.
@@ -23,7 +24,7 @@ impl Client {
     /// Uploads a file unless the service already has it, and returns its hash. Memory holds one piece.
     pub(in crate::cli) async fn upload(&self, path: &Path, bar: &ProgressBar) -> Result<Sha256> {
         let unreadable = |error: std::io::Error| CliError::file("read", path, &error);
-        let mut file = File::open(path).map_err(unreadable)?;
+        let mut file = open_input(path)?;
         let (sha256, size) = Sha256::of_reader(&mut file).map_err(unreadable)?;
         if size == 0 {
             return Err(CliError::Input(format!("{} is empty", path.display())).into());

@@ -9,7 +9,8 @@ use ndarray::{Array3, Axis};
 use super::report::{PAGE, Report};
 use crate::cli::CliError;
 use crate::cli::error::Result;
-use formats::{Channels, Limits, png, read_stack};
+use formats::display::{Encoding, Picture};
+use formats::{Channels, Limits, read_stack};
 
 /// The folder of the page's pictures.
 pub(super) const PICTURES: &str = "pictures";
@@ -45,7 +46,8 @@ pub(super) fn write(
     let picture =
         |name: &str, values: ndarray::ArrayView2<'_, f32>, white: f32| -> Result<String> {
             let name = format!("{name}.png");
-            let bytes = png::encode_u8(values, Channels::Grey, 0.0, white)?;
+            let picture = Picture::new(values, Channels::Grey, (0.0, white))?;
+            let bytes = picture.encode(Encoding::Png)?;
             let path = folder.join(&name);
             fs::write(&path, bytes).map_err(|error| unwritable(&path, error))?;
             Ok(format!("{PICTURES}/{name}"))
@@ -68,11 +70,11 @@ pub(super) fn write(
 }
 
 /// Name, picture and picture of the difference.
-type Picture<'a> = (&'a str, String, Option<String>);
+type Shown<'a> = (&'a str, String, Option<String>);
 
 fn page(
     (middle, measured): (usize, &str),
-    pictures: &[Picture<'_>],
+    pictures: &[Shown<'_>],
     reconstructions: &[Reconstruction],
     report: &Report,
 ) -> Markup {

@@ -1,6 +1,6 @@
 // Actions on one or several jobs: cancel, retry, rename, delete (with a confirmation).
 
-import { announce, h, put } from "./dom.js";
+import { announce, explained, h, put, trouble } from "./dom.js";
 import { menu } from "./menu.js";
 import { nameOf } from "./format.js";
 import { send } from "./api.js";
@@ -30,7 +30,7 @@ export function actions(job, done, more = []) {
             done(name, after);
           }
         } catch (error) {
-          await showMessage(`Could not ${action.word.toLowerCase()} ${nameOf(job)}`, error.message);
+          await showMessage(`Could not ${action.word.toLowerCase()} ${nameOf(job)}`, explained(error));
         }
         button.disabled = false;
       };
@@ -72,7 +72,7 @@ async function each(jobs, word, act) {
   await Promise.all(Array.from({ length: 4 }, work));
   announce(`${jobs.length - refused.length} jobs ${word}`);
   if (refused.length === 0) return;
-  await showMessage(`${refused.length} of ${jobs.length} could not be ${word}`, h("span", null, refused.slice(0, 5).map(([job, error]) => [`${nameOf(job)}: ${error.message}`, h("br")])));
+  await showMessage(`${refused.length} of ${jobs.length} could not be ${word}`, h("span", null, refused.slice(0, 5).map(([job, error]) => [`${nameOf(job)}: `, explained(error), h("br")])));
 }
 
 /** Asks for a new name; `change(name)` sends it (null removes the name). */
@@ -89,7 +89,7 @@ export function rename(before, change) {
       announce("Renamed");
       element.close();
     } catch (error) {
-      put(status, h("p", { class: "trouble", role: "alert" }, error.message));
+      put(status, trouble(error));
     }
   });
   open(element, form);

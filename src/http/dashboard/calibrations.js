@@ -4,7 +4,7 @@ import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
-import { announce, facts, h, place, put } from "./dom.js";
+import { announce, explained, facts, h, place, put, trouble } from "./dom.js";
 import { ask, rename, showMessage } from "./actions.js";
 import { every } from "./live.js";
 import { exact, figure, moment, momentInFull, nameOf } from "./format.js";
@@ -41,7 +41,7 @@ export function glance(item, signal) {
   return [
     ready ? h("img", { src: place(`/view/calibrations/${item.id}/pictures/mask-1?size=128`), alt: "", loading: "lazy", width: 72, height: 72 }) : h("span", { class: "blank" }),
     h("span", { class: "about" }, h("b", null, nameOf(item)),
-      ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
+      ready ? h("span", { class: "muted" }, `${item.frames} masks of ${item.height} × ${item.width}${item.dispersion ? ", spectral" : ""}`) : h("span", { class: item.state === "failed" ? "warn brief" : "muted" }, unready(item)),
       ready && grade(item.id, signal), h("time", { class: "muted", datetime: item.created_at, title: momentInFull(item.created_at) }, moment(item.created_at))),
   ];
 }
@@ -72,7 +72,7 @@ export async function calibration(root, [id], signal) {
       }) }, "Rename"), h("button", { type: "button", class: "small delete", onclick: () => erase(item) }, "Delete")]));
     if (item.state !== "ready") {
       const failed = item.state === "failed";
-      put(body, h("p", { class: failed ? "trouble" : "note" }, unready(item)), failed && h("p", null, h("a", { href: "#/new" }, "Create another calibration")));
+      put(body, failed ? trouble({ message: unready(item), code: item.problem?.code }) : h("p", { class: "note" }, unready(item)), failed && h("p", null, h("a", { href: "#/new" }, "Create another calibration")));
       return;
     }
     const masks = new Masks(item, signal);
@@ -100,7 +100,7 @@ async function erase(item) {
     announce("Calibration deleted");
     location.hash = "#/calibrations";
   } catch (error) {
-    await showMessage("Could not delete the calibration", error.message);
+    await showMessage("Could not delete the calibration", explained(error));
   }
 }
 

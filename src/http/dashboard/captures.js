@@ -27,7 +27,7 @@ export class Captures {
   constructor(signal, changed) {
     Object.assign(this, { items: [], changed });
     this.list = h("ol", { class: "captures", "aria-label": "Captures, in order" });
-    this.summary = h("p", { class: "muted", "aria-live": "polite" });
+    this.summary = h("p", { class: "muted below", "aria-live": "polite" });
     this.drop = dropZone("captures", "Raw captures", "Drop all files together: one per pattern, plus white and black. A file may hold several repeats.", signal, async (blob, file) => {
       const item = { sha256: blob.sha256, name: file.name, role: proposed(file.name), picture: await thumb(file) };
       // Patterns come first, because the user has to check their order.

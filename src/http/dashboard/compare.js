@@ -5,8 +5,8 @@ import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
-import { announce, h, put, say } from "./dom.js";
-import { bytes, duration, expectedRange, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
+import { announce, explained, h, put, say } from "./dom.js";
+import { bytes, decibels, duration, expectedRange, figure, iterationsOf, nameOf, shapeOf } from "./format.js";
 import { isAborted, get, send, upload } from "./api.js";
 import { networks, ran } from "./provenance.js";
 import { sampled } from "./values.js";
@@ -42,7 +42,7 @@ function truth(jobs, manifests, table, signal) {
     put(table, figures(jobs, manifests, found));
     say(status, "Measured against the true frames of the jobs.");
   };
-  const showError = (error) => isAborted(error) || put(status, h("span", { class: "warn" }, error.message));
+  const showError = (error) => isAborted(error) || put(status, h("span", { class: "warn" }, explained(error)));
   input.addEventListener("change", async () => {
     const file = input.files[0];
     if (!file) return;
@@ -241,9 +241,8 @@ class Group {
 /** Table of the jobs' settings and results, with the rows that differ first. */
 function figures(jobs, manifests, measured) {
   const rows = [
-    measured && ["PSNR", (_, index) => (measured[index].psnr === null ? "∞" : `${figure(measured[index].psnr, 4)} dB`), "quality"],
+    measured ? ["PSNR", (_, index) => decibels(measured[index].psnr), "quality"] : ["Expected PSNR", (job) => expectedRange(job.assessment)],
     measured && ["SSIM", (_, index) => figure(measured[index].ssim, 4), "quality"],
-    ["Expected PSNR", (job) => expectedRange(job.assessment)],
     ["State", (job) => job.state],
     ["Algorithm", (job) => job.algorithm],
     ["Planned iterations per tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],

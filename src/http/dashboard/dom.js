@@ -70,9 +70,21 @@ export function facts(pairs) {
   return h("dl", { class: "facts" }, rows.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]));
 }
 
+/** A text of the service, with the names in backticks as code. */
+export function marked(text) {
+  return String(text).split(/`([^`]+)`/).map((part, index) => (index % 2 ? h("code", null, part) : part));
+}
+
+/** An error's text, with a link to the page that explains it. */
+export function explained(error) {
+  const { code } = error;
+  const link = code && code !== "unknown" && h("a", { href: `/problems/${code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)");
+  return [marked(error.message ?? error), link && [" ", link]];
+}
+
 /** An error message. */
 export function trouble(error) {
-  return h("p", { class: "trouble", role: "alert" }, error.message ?? error);
+  return h("p", { class: "trouble", role: "alert" }, explained(error));
 }
 
 /** Debounces: calls `call` with the latest arguments after `wait` milliseconds without another call. */

@@ -2,7 +2,7 @@
 
 import { bytes } from "./format.js";
 import { isAborted, upload } from "./api.js";
-import { h, put, say } from "./dom.js";
+import { h, marked, put, say } from "./dom.js";
 
 /**
  * Creates a drop zone. Each file is uploaded and passed to `take(blob, file)` with the record of the blob. With
@@ -69,45 +69,7 @@ export function dropZone(id, title, hint, signal, take, many = false) {
 /** An error message with all invalid fields. */
 export function problem(error, about = null) {
   const errors = error.errors ?? [];
-  const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: ${item.detail}`))) : null;
-  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : error.message, list,
+  const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: `, marked(item.detail)))) : null;
+  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : marked(error.message), list,
     error.code && error.code !== "unknown" && h("p", null, h("a", { href: `/problems/${error.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
-}
-
-const SCALES = [1, 255, 1023, 4095, 16383, 65535];
-
-/**
- * Asks for the full scale if the check rejects or questions it. `again(scale)` repeats the request with the same
- * file.
- */
-export function askScale(again, question = "Which stored number means 1, the full light of one frame?") {
-  const other = h("input", { type: "number", min: 0, step: "any", "aria-label": "Another full scale", placeholder: "other" });
-  const use = h("button", { type: "button", class: "small", onclick: () => Number(other.value) > 0 && again(Number(other.value)) }, "Use");
-  return h("div", { class: "askscale", role: "group", "aria-label": "Full scale" }, h("p", null, h("b", null, question)),
-    h("div", { class: "row" }, SCALES.map((scale) => h("button", { type: "button", class: "small", onclick: () => again(scale) }, `${scale} means 1`)), other, use));
-}
-
-/** Names of the axis orders. */
-const ORDERS = { "frame-row-column": "frame, row, column", "row-column-frame": "row, column, frame", "column-row-frame": "column, row, frame", "frame-column-row": "frame, column, row" };
-
-/** Asks for the axis order, among those that the error names as possible. */
-function askAxes(error, again) {
-  const fit = Object.entries(ORDERS).filter(([name]) => error.message.includes(name));
-  return h("div", { class: "askscale", role: "group", "aria-label": "Axes" }, h("p", null, h("b", null, "What is the order of the array's axes?")),
-    h("div", { class: "row" }, fit.map(([name, words]) => h("button", { type: "button", class: "small", onclick: () => again(name) }, words))));
-}
-
-/** Asks for the array, among those that the error names. */
-function askArray(error, again) {
-  const names = [...error.message.replace(/^.*it contains/, "").matchAll(/'([^']+)'/g)].map(([, name]) => name);
-  return h("div", { class: "askscale", role: "group", "aria-label": "Array" }, h("p", null, h("b", null, "Which array of the file is it?")),
-    h("div", { class: "row" }, names.map((name) => h("button", { type: "button", class: "small", onclick: () => again(name) }, name))));
-}
-
-/** Asks for the setting that an error calls ambiguous; null if there is none. `again` receives it with those stated before. */
-export function askAbout(error, stated, again) {
-  if (error.reason === "missing_array" && error.message.includes("it contains '")) return askArray(error, (array) => again({ ...stated, array }));
-  if (error.reason === "axes_ambiguous") return askAxes(error, (axes) => again({ ...stated, axes }));
-  const scale = ["above_full_scale", "invalid_full_scale"].includes(error.reason) || (error.errors ?? []).some((item) => item.pointer === "/full_scale");
-  return scale ? askScale((full_scale) => again({ ...stated, full_scale })) : null;
 }

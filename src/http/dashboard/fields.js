@@ -1,6 +1,7 @@
 // Form fields with labels. An empty field has the value null.
 
-import { h } from "./dom.js";
+import { figure } from "./format.js";
+import { h, say } from "./dom.js";
 
 function field(id, label, properties) {
   const input = h("input", { id, ...properties });
@@ -26,9 +27,10 @@ const PACKINGS = [["", "one number per pixel"], ["mono12p", "12 bits, mono12p"],
 
 /**
  * Fields for a part of a file: a window of each image, with `frames` the first and last image, and the packing of the
- * pixels. `changed()` is called after each edit. `value()` has the stated properties of a request.
+ * pixels. `changed()` is called after each edit. `value()` has the stated properties of a request. `more` fields are shown
+ * with these.
  */
-export function partFields(id, frames, changed) {
+export function partFields(id, frames, changed, more = []) {
   const number = (name, label) => {
     const made = numberField(`${id}-${name}`, label, 1);
     made.input.min = 0;
@@ -39,19 +41,78 @@ export function partFields(id, frames, changed) {
   const range = frames ? [number("first", "First mask, from 0"), number("last", "Last mask")] : [];
   const packing = h("select", { id: `${id}-packing`, onchange: changed }, PACKINGS.map(([value, text]) => h("option", { value }, text)));
   const all = [...Object.values(window), ...range];
-  const element = h("details", { class: "part" }, h("summary", null, frames ? "Window, masks and packing" : "Window and packing"),
-    h("div", { class: "fields" }, all.map((one) => one.element), h("label", { for: `${id}-packing` }, "Pixels are stored as", packing)));
+  const element = h("details", { class: "part" }, h("summary", null, frames ? "Window, masks and packing" : "Window, packing and saturation"),
+    h("div", { class: "fields" }, all.map((one) => one.element), h("label", { for: `${id}-packing` }, "Pixels are stored as", packing), more.map((one) => one.element)));
+  const inputs = { ...window, ...(frames ? { first: range[0], last: range[1] } : {}) };
   const value = () => {
     const crop = Object.fromEntries(Object.entries(window).map(([name, one]) => [name, one.value()]));
     const [first, last] = range.map((one) => one.value());
     const whole = Object.values(crop).some((side) => side === null);
     return given({ crop: whole ? null : crop, frames: range.length && first !== null && last !== null ? [first, last] : null, packing: packing.value || null });
   };
-  /** Opens the fields, and proposes a window of this size. */
-  const propose = (height, width) => {
+  /** Shows these settings: `row`, `column`, `height`, `width`, `first` and `last`. */
+  const set = (settings) => {
     element.open = true;
-    for (const [name, side] of Object.entries({ row: 0, column: 0, height, width })) window[name].input.value = side;
-    window.row.input.focus();
+    for (const [name, side] of Object.entries(settings)) inputs[name].input.value = side ?? "";
   };
-  return { element, value, propose };
+  const setPacking = (name) => (packing.value = name ?? "");
+  return { element, value, set, setPacking };
+}
+
+const AXES = [["column", "to the right, along a row"], ["row", "downwards, along a column"]];
+const EXTENTS = [["scene", "the scene: it has the size of a band"], ["measurement", "the measurement: it has its size"]];
+
+/** The numbers of a text, START:STEP:COUNT or a list; null if it is empty. Throws for other texts. */
+export function numbersOf(text) {
+  const clean = text.replaceAll(/[[\]]/g, " ").trim();
+  if (clean === "") return null;
+  const number = (word) => {
+    if (word === "" || !Number.isFinite(Number(word))) throw new Error(`“${word}” is no number. State START:STEP:COUNT or a list.`);
+    return Number(word);
+  };
+  if (!clean.includes(":")) return clean.split(/[\s,;]+/).filter(Boolean).map(number);
+  const [start, step, count, ...rest] = clean.split(":").map((word) => number(word.trim()));
+  if (!(count >= 1 && count <= 1000) || !Number.isInteger(count) || rest.length > 0) throw new Error("State START:STEP:COUNT, with a whole number of bands as COUNT.");
+  return Array.from({ length: count }, (_, index) => Number((start + step * index).toPrecision(12)));
+}
+
+/**
+ * Fields for the dispersion of a spectral camera. `value()` has it as in a request, and throws if it is incomplete;
+ * `changed()` is called after each edit.
+ */
+export function dispersionFields(changed) {
+  const edit = () => {
+    try {
+      const { offsets, wavelengths } = value();
+      const range = (numbers, unit) => `${figure(Math.min(...numbers), 4)} to ${figure(Math.max(...numbers), 4)} ${unit}`;
+      say(summary, `${offsets.length} bands, displaced by ${range(offsets, "pixels")}${wavelengths ? `; ${range(wavelengths, "nm")}` : ""}.`);
+    } catch (error) {
+      say(summary, error.message);
+    }
+    changed();
+  };
+  const select = (id, label, options) => {
+    const input = h("select", { id, onchange: edit }, options.map(([name, text]) => h("option", { value: name }, text)));
+    return { input, element: h("label", { for: id }, label, input) };
+  };
+  const [axis, mask] = [select("dispersion-axis", "Bands are displaced", AXES), select("dispersion-mask", "The mask covers", EXTENTS)];
+  const [offsets, wavelengths] = [field("dispersion-offsets", "Displacement of each band in pixels", { type: "text", placeholder: "0:2:28", autocomplete: "off" }), field("dispersion-wavelengths", "Wavelength of each band in nm (optional)", { type: "text", placeholder: "450:7.4:28", autocomplete: "off" })];
+  for (const { input } of [offsets, wavelengths]) input.addEventListener("change", edit);
+  const summary = h("p", { class: "muted", "aria-live": "polite" });
+  const element = h("div", { hidden: true },
+    h("p", { class: "muted" }, "One mask codes all bands, and a prism or grating displaces them. State START:STEP:COUNT, such as 0:2:28 for 28 bands at 2 pixels per band, or a list, such as 0, 1.8, 3.9."),
+    h("div", { class: "fields" }, [offsets, wavelengths, axis, mask].map((one) => one.element)), summary);
+  const value = () => {
+    const found = { axis: axis.input.value, mask: mask.input.value, offsets: numbersOf(offsets.input.value), wavelengths: numbersOf(wavelengths.input.value) };
+    if (!found.offsets) throw new Error("State the displacement of each band.");
+    if (found.wavelengths && found.wavelengths.length !== found.offsets.length) throw new Error(`There are ${found.offsets.length} displacements, but ${found.wavelengths.length} wavelengths. State one of each for every band.`);
+    return given(found);
+  };
+  /** Shows a dispersion. */
+  const set = (found) => {
+    [axis.input.value, mask.input.value] = [found.axis, found.mask];
+    offsets.input.value = found.offsets.join(", ");
+    wavelengths.input.value = found.wavelengths?.join(", ") ?? "";
+  };
+  return { element, value, set };
 }

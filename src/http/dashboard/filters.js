@@ -12,7 +12,7 @@ export function filters(query, changed) {
   // A URL may name a combination of states that is not among the choices.
   const choices = CHOICES.some(([value]) => value === wanted) ? CHOICES : [...CHOICES, [wanted, wanted]];
   const state = h("select", { id: "state" }, choices.map(([value, text]) => h("option", { value, selected: value === wanted }, text)));
-  const search = h("input", { type: "search", id: "search", placeholder: "Name or identifier", maxlength: 200, autocomplete: "off", value: query.get("search") ?? "" });
+  const search = h("input", { type: "search", id: "search", placeholder: "Name or ID", maxlength: 200, autocomplete: "off", value: query.get("search") ?? "" });
   const keep = h("button", { type: "button", class: "small", hidden: true, onclick: () => store([...saved(), value()]) }, "Save this filter");
   const chips = h("span", { class: "row chips" });
 

@@ -11,14 +11,20 @@ export function expectedRange(assessment) {
   return high >= 40 ? `${low} dB or more` : `${low} to ${high} dB`;
 }
 
+/** An estimated duration without digits that are uncertain: 75 -> "2 min". */
+export function roughly(seconds) {
+  return duration(seconds > 60 ? 60 * Math.ceil(seconds / 60) : Math.max(1, seconds));
+}
+
 /** 75 -> "1 min 15 s". */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   const whole = Math.max(0, Math.round(seconds));
   if (whole < 60) return `${whole} s`;
-  if (whole < 3600) return `${Math.floor(whole / 60)} min ${whole % 60} s`;
-  if (whole < 86400) return `${Math.floor(whole / 3600)} h ${Math.floor((whole % 3600) / 60)} min`;
-  return `${Math.floor(whole / 86400)} d ${Math.floor((whole % 86400) / 3600)} h`;
+  const pair = (large, one, small, other) => `${large} ${one}${small > 0 ? ` ${small} ${other}` : ""}`;
+  if (whole < 3600) return pair(Math.floor(whole / 60), "min", whole % 60, "s");
+  if (whole < 86400) return pair(Math.floor(whole / 3600), "h", Math.floor((whole % 3600) / 60), "min");
+  return pair(Math.floor(whole / 86400), "d", Math.floor((whole % 86400) / 3600), "h");
 }
 
 /** 1536 -> "1.5 KiB". */
@@ -76,6 +82,13 @@ export function frameName({ dispersion }, frame) {
   return `${dispersion ? "band" : "frame"} ${frame}${wavelength === undefined ? "" : ` · ${figure(wavelength, 4)} nm`}`;
 }
 
+/** The axis of a job's frames, and their places on it: numbers from 1, or wavelengths. */
+export function axisOf({ dispersion, shape }) {
+  const numbers = Array.from({ length: shape.frames }, (_, index) => index + 1);
+  if (!dispersion) return { spectral: false, name: "frame", xs: numbers };
+  return dispersion.wavelengths ? { spectral: true, name: "wavelength in nm", xs: dispersion.wavelengths } : { spectral: true, name: "band", xs: numbers };
+}
+
 /** "8 × 256 × 256", and with `all` the number of snapshots if there are several. */
 export function shapeOf(job, all = true) {
   const { frames, height, width, mosaic } = job.shape;
@@ -101,8 +114,8 @@ export function stageOf(job) {
 /** Remaining time of an active job, or duration of a job that has ended. */
 export function timeOf(job) {
   const { eta_seconds: eta, queue_position: position } = job.progress;
-  if (job.state === "queued") return [position && `position ${position} in the queue`, eta === null ? "no worker running" : `done in up to about ${duration(eta)}`].filter(Boolean).join(", ");
-  if (job.state === "running") return eta === null ? "no worker running" : `up to about ${duration(eta)} left`;
+  if (job.state === "queued") return [position && `position ${position} in the queue`, eta === null ? "no worker running" : `done in up to about ${roughly(eta)}`].filter(Boolean).join(", ");
+  if (job.state === "running") return eta === null ? "no worker running" : `up to about ${roughly(eta)} left`;
   if (job.state === "cancelling") return "stopping";
   if (!job.started_at || !job.finished_at) return "";
   const seconds = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
@@ -125,6 +138,23 @@ export function verdictOf(job, assessment = job.assessment) {
   if (assessment) return [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `Measurement and calibration fit each other. ${LIKE[assessment.grade]}`];
   return ["unknown", "not judged", "Not judged", "Measurement and calibration fit each other. No quality can be predicted for this algorithm or sensor. Attach true frames, if you have them, to measure it."];
 }
+
+/** Verdicts on a measured PSNR: kind, word, title, reason, and the lower limit in dB, in descending order. */
+const LEVELS = [
+  ["good", "excellent", "Excellent", "35 dB or more: errors are hard to see.", 35],
+  ["good", "good", "Good", "28 to 35 dB: expect softened detail.", 28],
+  ["usable", "usable", "Usable", "22 to 28 dB: expect lost texture.", 22],
+  ["bad", "bad", "Bad", "Less than 22 dB: expect only coarse shapes.", -Infinity],
+];
+
+/** The verdict on a PSNR against true frames, as `verdictOf`; null means that the frames are identical. */
+export function measuredVerdict(psnr) {
+  if (psnr === null) return ["good", "identical", "Identical to the true frames", LEVELS[0][3]];
+  return LEVELS.find(([, , , , least]) => psnr >= least).slice(0, 4);
+}
+
+/** A measured PSNR; null means that the frames are identical. */
+export const decibels = (psnr) => (psnr === null ? "∞ dB" : `${figure(psnr, 3)} dB`);
 
 /** The look of frames of a grade. */
 const LIKE = {

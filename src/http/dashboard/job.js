@@ -1,10 +1,11 @@
 // One job: its quality, frames, files and method.
 
 import { actions, rename } from "./actions.js";
-import { announce, h, put, trouble } from "./dom.js";
+import { announce, h, marked, put, trouble } from "./dom.js";
 import { bytes, nameOf, stageOf, timeOf } from "./format.js";
 import { isAborted, get, send } from "./api.js";
 import { Made } from "./provenance.js";
+import { registration } from "./registration.js";
 import { movieLink } from "./movie.js";
 import { TileMap } from "./tilemap.js";
 import { Verdict } from "./verdict.js";
@@ -23,13 +24,15 @@ export async function job(root, [id], signal) {
   const verdict = new Verdict(found, signal);
   const viewer = new Viewer(found, signal);
   viewer.next = () => snapshot.next();
+  verdict.changed = (truth) => viewer.setTruth(truth);
+  const moved = h("div");
   const made = new Made(found, signal);
   const tiles = new TileMap(found, signal);
   root.append(
     h("div", { class: "row head" }, title, state, snapshot.element, h("span", { class: "grow" }), buttons),
     progress, problem,
     h("div", { class: "stage three" }, verdict.element, viewer.element, h("div", { class: "side" }, viewer.beside, files)),
-    h("div", { class: "cards" }, made.element, h("div", { class: "stack" }, tiles.plotCard, tiles.tilesCard)));
+    h("div", { class: "cards" }, made.element, h("div", { class: "stack" }, moved, tiles.plotCard, tiles.tilesCard)));
   camera(found, viewer, signal);
 
   let shown = null;
@@ -57,6 +60,8 @@ export async function job(root, [id], signal) {
     call(nameOf(now));
     put(progress, line(now));
     viewer.state = now.state;
+    viewer.setTruth(now.truth);
+    if (now.registered !== shown?.registered) put(moved, registration(now));
     await tiles.renew(snapshot.value());
     const done = `${now.progress.previews_done} ${now.progress.tiles_done} ${now.progress.snapshots_done} ${now.state}`;
     if (shown && done !== ready) await viewer.renew();
@@ -96,8 +101,8 @@ async function camera(found, viewer, signal) {
 
 /** The failure of a job: its reason, the remedy, and the page that explains it. */
 function failure({ error, problem }) {
-  return h("div", { class: "trouble", role: "alert" }, h("p", null, error),
-    problem?.remedy && h("p", null, h("b", null, "What to do: "), problem.remedy),
+  return h("div", { class: "trouble", role: "alert" }, h("p", null, marked(error)),
+    problem?.remedy && h("p", null, h("b", null, "What to do: "), marked(problem.remedy)),
     problem && h("p", null, h("a", { href: `/problems/${problem.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
 }
 

@@ -2,9 +2,10 @@
 
 import { announce, h, place, put, say } from "./dom.js";
 import { cancelAll, removeAll, actions } from "./actions.js";
-import { aboutDecibels, doubts, expectedRange, moment, momentInFull, nameOf, shapeOf, short, stageOf, timeOf, verdictOf } from "./format.js";
+import { aboutDecibels, decibels, doubts, expectedRange, measuredVerdict, moment, momentInFull, nameOf, shapeOf, short, stageOf, timeOf, verdictOf } from "./format.js";
 import { filters } from "./filters.js";
 import { get } from "./api.js";
+import { qualityOf } from "./quality.js";
 import { table } from "./rows.js";
 import { watch } from "./live.js";
 import { welcome } from "./welcome.js";
@@ -223,7 +224,7 @@ function thumb(cell, job, before) {
     put(cell, h("span", { class: "blank" }));
     return;
   }
-  const path = `/view/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/frame-${Math.ceil(job.shape.frames / 2)}?size=128`;
+  const path = `/view/jobs/${job.id}/snapshots/${job.snapshots.first}/pictures/${job.dispersion?.wavelengths ? "colours" : `frame-${Math.ceil(job.shape.frames / 2)}`}?size=128`;
   const image = h("img", { src: place(`${path}#${version}`), alt: "", loading: "lazy", decoding: "async", width: 64, height: 46 });
   image.addEventListener("error", () => image.replaceWith(h("span", { class: "blank" })));
   put(cell, image);
@@ -245,17 +246,32 @@ function state(cell, job, before) {
   say(cell.lastChild, [bar && `${Math.floor(job.progress.percent)} %`, bar && stageOf(job), timeOf(job)].filter(Boolean).join(" · "));
 }
 
-/** The verdict in a word, the number of findings, and the expected PSNR. A job that has not succeeded has only findings. */
+/**
+ * The verdict in a word, the number of findings, and the PSNR: measured if the job has true frames, else expected. A job that
+ * has not succeeded has only findings.
+ */
 function verdict(cell, job, before) {
-  if (before && before.state === job.state && before.warnings.length === job.warnings.length && !before.assessment === !job.assessment) return;
+  const same = before && before.state === job.state && before.truth === job.truth && before.warnings.length === job.warnings.length && !before.assessment === !job.assessment;
+  if (same) return;
   const found = doubts(job);
-  const psnr = job.assessment?.psnr_db ?? null;
-  const [kind, word] = job.state === "succeeded" ? verdictOf(job) : ["", ""];
-  put(cell, word && h("span", { class: `grade ${kind}` }, word),
-    h("span", { class: "sub" },
-      found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text),
-      found && psnr !== null && " · ",
-      psnr !== null && h("span", { title: `Expected PSNR ${expectedRange(job.assessment)}` }, `about ${aboutDecibels(psnr)}`)));
+  const mark = found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text);
+  const show = (kind, word, psnr) => put(cell, word && h("span", { class: `grade ${kind}` }, word), h("span", { class: "sub" }, mark, mark && psnr && " · ", psnr));
+  const expected = () => {
+    const [kind, word] = job.state === "succeeded" ? verdictOf(job) : ["", ""];
+    const psnr = job.assessment?.psnr_db ?? null;
+    show(kind, word, psnr === null ? job.assessment && !found && "no expected PSNR" : h("span", { title: `Expected PSNR ${expectedRange(job.assessment)}` }, `about ${aboutDecibels(psnr)}`));
+  };
+  const asked = (cell.dataset.truth = `${job.id} ${job.truth}`);
+  if (job.state !== "succeeded" || !job.truth) {
+    expected();
+    return;
+  }
+  show("unknown", "", "measuring …");
+  const current = () => cell.isConnected && cell.dataset.truth === asked;
+  qualityOf(job, current).then(({ psnr }) => {
+    const [kind, word] = measuredVerdict(psnr);
+    if (current()) show(kind, word, h("span", { title: "PSNR against the true frames of this job" }, `${decibels(psnr)} measured`));
+  }).catch(() => current() && expected());
 }
 
 function frames(cell, job) {

@@ -75,7 +75,8 @@ export class Pane {
     this.badge = h("p", { class: "onpicture", hidden: true });
     this.sight = h("div", { class: "sight" }, this.canvas, this.note, this.badge);
     // The frame takes the shape of the picture, so that nothing around it is black.
-    this.sight.style.setProperty("--ratio", String(view.width / view.height));
+    const shape = () => this.sight.style.setProperty("--ratio", String(view.width / view.height));
+    shape();
     this.readout = h("p", { class: "readout muted" }, HINT);
     this.element = h("figure", { class: "pane" }, h("figcaption", null, this.title, this.tools), this.sight, this.readout);
     /** Words for a value of the picture. */
@@ -86,6 +87,7 @@ export class Pane {
     this.marks = [];
     this.redraw = this.redraw.bind(this);
     view.listen(() => {
+      shape();
       this.moved = true;
       this.redraw();
     }, signal);

@@ -1,11 +1,12 @@
-// Curves of a job's frames: a pixel through time, a profile along a line, and the mean of a region through time.
+// Curves of a job's frames: a pixel through time, a profile along a line, and the mean of a region through time. The bands
+// of a spectral camera give spectra instead.
 
 import { alongLine, regionMeans, throughTime } from "./values.js";
 import { csvLink, plot } from "./plot.js";
-import { h, put, say } from "./dom.js";
+import { explained, h, put, say } from "./dom.js";
 import { isAborted } from "./api.js";
 
-const KINDS = [["point", "A pixel through time"], ["line", "Profile along a line"], ["region", "Mean of a region through time"]];
+const KINDS = [["point", "A pixel through time", "Spectrum of a pixel"], ["line", "Profile along a line", "Profile along a line"], ["region", "Mean of a region through time", "Mean spectrum of a region"]];
 const HINTS = {
   point: "Click a pixel of the frames, or enter its row and column.",
   line: "Drag a line on the frames, or enter its ends.",
@@ -15,12 +16,15 @@ const HINTS = {
 const MAX_PIXELS = 4_000_000;
 const MARK = "rgb(255 176 0)";
 
-/** `picture()` has the current picture and `frames()` the base of all frames; `unit()` the words for a value. */
+/**
+ * `axis` has the name of the frames' axis and their places `xs` on it. `picture()` has the current picture, `stack()` the base
+ * of all frames, `called()` the name of the current frame, and `unit()` the words for a value.
+ */
 export class Probe {
-  constructor(pane, frames, { picture, stack, frame, unit }, name, signal) {
+  constructor(pane, { spectral, name: axis, xs }, { picture, stack, called, unit }, name, signal) {
     const { height, width } = pane.view;
-    Object.assign(this, { pane, frames, picture, stack, frame, unit, name, signal, ends: null, kind: "point" });
-    const select = h("select", { id: "curve", "aria-label": "Curve" }, KINDS.map(([value, text]) => h("option", { value }, text)));
+    Object.assign(this, { pane, axis, xs, picture, stack, called, unit, name, signal, ends: null, kind: "point" });
+    const select = h("select", { id: "curve", "aria-label": "Curve" }, KINDS.map(([value, text, spectrum]) => h("option", { value }, spectral ? spectrum : text)));
     select.addEventListener("change", () => this.choose(select.value));
     const field = (id, label, most) => {
       const input = h("input", { type: "number", id, min: 0, max: most - 1, step: 1 });
@@ -28,11 +32,11 @@ export class Probe {
       return { input, element: h("label", { for: id, class: "row muted" }, label, input) };
     };
     this.select = select;
-    this.fields = [field("curve-row", "Row", height), field("curve-column", "Column", width), field("curve-row-2", "to row", height), field("curve-column-2", "Column", width)];
+    this.fields = [field("curve-row", "Row", height), field("curve-column", "column", width), field("curve-row-2", "to row", height), field("curve-column-2", "column", width)];
     this.hint = h("p", { class: "muted" });
     this.result = h("div", { "aria-live": "polite" });
-    this.element = h("details", { class: "probe" }, h("summary", null, "Curves and profiles"),
-      h("div", { class: "row" }, select, this.fields.map((one) => one.element)), this.hint, this.result);
+    this.element = h("details", { class: "probe" }, h("summary", null, spectral ? "Spectra and profiles" : "Curves and profiles"),
+      h("div", { class: "row" }, select, [this.fields.slice(0, 2), this.fields.slice(2)].map((pair) => h("span", { class: "row" }, pair.map((one) => one.element)))), this.hint, this.result);
     this.element.addEventListener("toggle", () => this.redraw());
     pane.tool = this;
     pane.marks.push((context, target, scale) => this.mark(context, target, scale));
@@ -125,27 +129,30 @@ export class Probe {
     const asked = (this.asked = {});
     const { factor, words } = this.unit();
     try {
-      const { values, xName, first, place } = await this.read();
+      const { values, xName, xs, place } = await this.read();
       if (asked !== this.asked || this.signal.aborted) return;
       const inUnit = `value in ${words.replace("× ", "")}`;
       const shown = values.map((value) => value * factor);
       const file = `${this.name()}_${place.replaceAll(/[^0-9a-z]+/gi, "_")}.csv`;
-      put(this.result, plot(shown, { xName, yName: inUnit, first, width: Math.min(560, this.result.clientWidth || 560) }), h("div", { class: "row" }, h("span", { class: "muted" }, `${place}: ${inUnit}`), csvLink(file, [xName, "value"], shown.map((value, index) => [first + index, value]))));
+      put(this.result, plot(shown, { xName, yName: inUnit, xs, width: Math.min(560, this.result.clientWidth || 560) }), h("div", { class: "row" }, h("span", { class: "muted" }, `${place}: ${inUnit}`), csvLink(file, [xName, "value"], shown.map((value, index) => [xs[index], value]))));
     } catch (error) {
-      if (asked === this.asked && !isAborted(error)) put(this.result, h("p", { class: "warn" }, error.message));
+      if (asked === this.asked && !isAborted(error)) put(this.result, h("p", { class: "warn" }, explained(error)));
     }
   }
 
   async read() {
     const [from, to] = this.ends;
+    const frames = this.xs.length;
+    const along = { xName: this.axis, xs: this.xs };
     if (this.kind === "point") {
-      return { values: await throughTime(this.stack(), this.frames, ...from), xName: "frame", first: 1, place: `Row ${from[0]}, column ${from[1]}` };
+      return { ...along, values: await throughTime(this.stack(), frames, ...from), place: `Row ${from[0]}, column ${from[1]}` };
     }
     if (this.kind === "line") {
-      return { values: await alongLine(this.picture(), from, to), xName: "pixel along the line", first: 0, place: `Frame ${this.frame()}, row ${from[0]}, column ${from[1]} to row ${to[0]}, column ${to[1]}` };
+      const values = await alongLine(this.picture(), from, to);
+      return { values, xName: "pixel along the line", xs: values.map((_, index) => index), place: `${this.called()}, row ${from[0]}, column ${from[1]} to row ${to[0]}, column ${to[1]}` };
     }
     const [top, left, bottom, right] = this.corners();
-    if ((bottom - top + 1) * (right - left + 1) * this.frames > MAX_PIXELS) throw new Error("This region is too large to read. Drag a smaller one, or use the Python client.");
-    return { values: await regionMeans(this.stack(), this.frames, this.corners()), xName: "frame", first: 1, place: `Rows ${top} to ${bottom}, columns ${left} to ${right}` };
+    if ((bottom - top + 1) * (right - left + 1) * frames > MAX_PIXELS) throw new Error("This region is too large to read. Drag a smaller one, or use the Python client.");
+    return { ...along, values: await regionMeans(this.stack(), frames, this.corners()), place: `Rows ${top} to ${bottom}, columns ${left} to ${right}` };
   }
 }

@@ -1,6 +1,6 @@
 // The card "How it was made": plan, cost and decisions, and the full manifest.
 
-import { announce, facts, h, place, put, say } from "./dom.js";
+import { announce, explained, facts, h, place, put, say } from "./dom.js";
 import { bytes, duration, figure, iterationsOf, momentInFull, shapeOf } from "./format.js";
 
 /** The card; `show` adds the data of a snapshot's manifest. */
@@ -33,7 +33,7 @@ export class Made {
   show(job, manifest, href) {
     if (job.state !== "succeeded") return;
     if (manifest.error) {
-      put(this.body, this.plan(), h("p", { class: "warn" }, manifest.error.message));
+      put(this.body, this.plan(), h("p", { class: "warn" }, explained(manifest.error)));
       return;
     }
     const { content, run } = manifest;

@@ -1,6 +1,6 @@
 // The report on a calibration: grade, findings with remedies, and correlation of the masks.
 
-import { facts, h, put, s } from "./dom.js";
+import { facts, h, marked, put, s } from "./dom.js";
 import { figure } from "./format.js";
 import { isAborted, get } from "./api.js";
 
@@ -11,8 +11,8 @@ export function findings(found) {
     const [item] = same;
     const about = same.length > 1 ? `${same.length} snapshots (${ranges(same.map(({ snapshot }) => snapshot))}); in snapshot ${item.snapshot}: ` : Number.isInteger(item.snapshot) ? `Snapshot ${item.snapshot}: ` : "";
     return h("li", { class: item.severity },
-      h("p", null, h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about, item.detail),
-      item.remedy && h("p", null, h("b", null, "What to do: "), item.remedy));
+      h("p", null, h("b", null, item.severity === "error" ? "Error: " : "Warning: "), about, marked(item.detail)),
+      item.remedy && h("p", null, h("b", null, "What to do: "), marked(item.remedy)));
   }));
 }
 

@@ -1,12 +1,13 @@
 // A new job in three steps: calibration, measurement, and reconstruction with an estimate of its cost.
 
 import { announce, calmly, facts, h, put, say } from "./dom.js";
-import { askAbout, askScale, dropZone, problem } from "./drop.js";
-import { bytes, duration, exact, figure } from "./format.js";
+import { askAbout, askExtent, askFrames, askMove, askScale, askWindow } from "./questions.js";
+import { dropZone, problem } from "./drop.js";
+import { bytes, exact, figure, roughly } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings, grade } from "./report.js";
 import { create, isAborted, get, send } from "./api.js";
-import { given, numberField, partFields, textField } from "./fields.js";
+import { dispersionFields, given, numberField, partFields, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
 const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
@@ -23,7 +24,8 @@ export async function submit(root, [query], signal) {
   };
   const measurement = measurementStep(form, changed, signal);
   const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, query.get("calibration"), signal);
-  const element = h("form", { class: "steps" }, calibration, measurement.element, job.element, h("div", { class: "row" }, button), result);
+  form.vary = calibration.vary;
+  const element = h("form", { class: "steps" }, calibration.element, measurement.element, job.element, h("div", { class: "row" }, button), result);
   element.addEventListener("submit", async (event) => {
     event.preventDefault();
     button.disabled = true;
@@ -49,7 +51,8 @@ function choice(name, label, options, chosen, changed) {
   return h("fieldset", { class: "choice" }, h("legend", null, label), options.map(input));
 }
 
-const SENSORS = [["", "grey"], ...["rggb", "bggr", "grbg", "gbrg"].map((name) => [name, `in colour, ${name.toUpperCase()}`])];
+const SPECTRAL = "spectral";
+const SENSORS = [["", "grey"], ...["rggb", "bggr", "grbg", "gbrg"].map((name) => [name, `in colour, ${name.toUpperCase()}`]), [SPECTRAL, "behind a prism or grating (spectral)"]];
 
 function calibrationStep(form, known, wake, wanted, signal) {
   const verdict = h("div", { class: "verdict", "aria-live": "polite" });
@@ -59,21 +62,54 @@ function calibrationStep(form, known, wake, wanted, signal) {
   };
   const name = textField("calibration-name", "Name of the calibration", "bench 3, f/8");
   const sensor = h("select", { id: "mosaic" }, SENSORS.map(([value, text]) => h("option", { value }, text)));
-  const nameRow = h("div", { class: "fields" }, name.element, h("label", { for: "mosaic" }, "The sensor is", sensor));
-  const settings = () => given({ name: name.value(), mosaic: sensor.value || null });
-  const parts = { known: stored(known, wanted, use, signal), masks: masks(settings, sensor, use, verdict, signal), captures: captures(settings, use, verdict, signal) };
+  const sensorLabel = h("label", { for: "mosaic" }, "The sensor is", sensor);
+  const nameRow = h("div", { class: "fields" }, name.element, sensorLabel);
+  const isSpectral = () => sensor.value === SPECTRAL;
+  const settings = () => given({ name: name.value(), mosaic: isSpectral() ? null : sensor.value || null });
+  const made = masks(() => given({ ...settings(), dispersion: isSpectral() ? dispersion.value() : null }), use, verdict, signal);
+  const dispersion = dispersionFields(() => made.repeat());
+  // A change of the sensor repeats the request with the same file.
+  sensor.addEventListener("change", () => {
+    arrange();
+    made.repeat();
+  });
+  const parts = { known: stored(known, wanted, use, signal), masks: made, captures: captures(settings, use, verdict, signal) };
   const options = [known.length > 0 && ["known", "A stored calibration"], ["masks", "Masks"], ["captures", "Raw captures"]].filter(Boolean);
+  let kind = options[0][0];
+  const arrange = () => {
+    // Captures are of one mask per frame.
+    [...sensor.options].at(-1).disabled = kind === "captures";
+    if (kind === "captures" && isSpectral()) sensor.value = "";
+    dispersion.element.hidden = !isSpectral() || kind !== "masks";
+  };
   const show = (value) => {
+    kind = value;
     for (const [key, part] of Object.entries(parts)) part.element.hidden = key !== value;
     nameRow.hidden = value === "known";
+    arrange();
     put(verdict);
     use(null);
     parts[value].wake?.();
   };
-  const first = options[0][0];
-  const element = step(1, "Calibration", choice("calibration-kind", "What do you have?", options, first, show), nameRow, Object.values(parts).map((part) => part.element), verdict);
-  queueMicrotask(() => show(first));
-  return element;
+  const radios = choice("calibration-kind", "What do you have?", options, kind, show);
+  const element = step(1, "Calibration", radios, nameRow, dispersion.element, Object.values(parts).map((part) => part.element), verdict);
+  queueMicrotask(() => show(kind));
+  /** Makes another calibration from the masks of the present one, with another window or other masks of a spectral camera. */
+  const vary = ({ crop, mask }) => {
+    const item = form.calibration;
+    if (kind !== "masks") {
+      radios.querySelector("[value=masks]").checked = true;
+      show("masks");
+      name.input.value = item.name ?? "";
+      sensor.value = item.dispersion ? SPECTRAL : item.mosaic ?? "";
+      made.adopt(item);
+    }
+    if (item.dispersion) dispersion.set({ ...item.dispersion, ...given({ mask: mask ?? null }) });
+    if (crop) made.part.set(crop);
+    arrange();
+    made.repeat();
+  };
+  return { element, vary };
 }
 
 /** Stored calibrations, each with a mask, name and grade. */
@@ -85,8 +121,8 @@ function stored(known, wanted, use, signal) {
   return { element, wake };
 }
 
-function masks(settings, sensor, use, verdict, signal) {
-  // The file that was dropped last, with the full scale and axes stated for it.
+function masks(settings, use, verdict, signal) {
+  // The file that was dropped last, with the full scale, array and axes stated for it.
   let last = null;
   const repeat = () => last && make(...last).catch((error) => put(verdict, problem(error)));
   const part = partFields("masks-part", true, repeat);
@@ -100,15 +136,21 @@ function masks(settings, sensor, use, verdict, signal) {
       put(verdict, accepted(item, signal), h("details", null, h("summary", null, `Full scale of the masks: ${exact(item.full_scale)}`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
     } catch (error) {
-      const question = askAbout(error, stated, (next) => make(sha256, next).catch((later) => put(verdict, problem(later))));
-      if (!question) throw error;
-      put(verdict, problem(error), question);
+      if (isAborted(error)) throw error;
+      const again = (next) => make(sha256, next).catch((later) => put(verdict, problem(later)));
+      put(verdict, problem(error), askAbout(error, stated, again, { frames: () => askFrames(error, part, repeat) }));
     }
   };
-  // A change of the sensor repeats the request with the same file.
-  sensor.addEventListener("change", repeat);
-  const drop = dropZone("masks", "Calibration set", `one mask per frame: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
-  return { element: h("div", null, drop.element, part.element) };
+  const drop = dropZone("masks", "Calibration set", `one mask per frame, or the only mask of a spectral camera: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
+  /** Takes the file of a stored calibration, with its settings. */
+  const adopt = ({ masks: file, full_scale, axes, reading }) => {
+    const { crop, frames, packing } = reading ?? {};
+    const [first, last_] = frames ?? [null, null];
+    part.set({ ...(crop ?? { row: null, column: null, height: null, width: null }), first, last: last_ });
+    part.setPacking(packing);
+    last = [file, given({ full_scale, axes })];
+  };
+  return { element: h("div", null, drop.element, part.element), part, repeat, adopt };
 }
 
 function captures(settings, use, verdict, signal) {
@@ -140,7 +182,7 @@ function accepted(item, signal) {
   return [
     h("p", null, "The calibration is accepted. ", grade(item.id, signal)),
     facts([
-      ["Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
+      [item.dispersion ? "Masks of bands" : "Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
       ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them`) : "none"],
@@ -157,6 +199,7 @@ function measurementStep(form, changed, signal) {
   const wait = h("p", { class: "muted" }, "Select or create the calibration first.");
   const name = textField("measurement-name", "Name of the measurement", "shot 12");
   const [fps, exposure] = [numberField("fps", "Snapshots per second"), numberField("exposure", "Exposure in s")];
+  const saturation = numberField("saturation", "Saturated from (stored number)", 1);
   const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
   const darks = [];
   const darkList = h("p", { class: "muted" });
@@ -167,7 +210,7 @@ function measurementStep(form, changed, signal) {
     forget.hidden = darks.length === 0;
     if (last) make(last, known).catch((error) => put(verdict, problem(error)));
   };
-  const part = partFields("data-part", false, () => last && make(last, known).catch((error) => put(verdict, problem(error))));
+  const part = partFields("data-part", false, () => last && make(last, known).catch((error) => put(verdict, problem(error))), [saturation]);
   // The file that was dropped last, the full scale and axes stated for it, and the number of the latest attempt.
   let [last, known, attempt] = [null, {}, 0];
   const make = async (sha256, stated = {}) => {
@@ -176,7 +219,7 @@ function measurementStep(form, changed, signal) {
     form.measurement = null;
     changed();
     put(verdict);
-    const body = { name: name.value(), ...part.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), sequence: sequence.value || null };
+    const body = { name: name.value(), ...part.value(), ...stated, camera_fps: fps.value(), exposure_s: exposure.value(), saturation: saturation.value(), sequence: sequence.value || null };
     const again = (next) => make(sha256, next).catch((error) => put(verdict, problem(error)));
     [last, known] = [sha256, stated];
     try {
@@ -187,20 +230,20 @@ function measurementStep(form, changed, signal) {
       form.measurement = item;
     } catch (error) {
       if (mine !== attempt) return;
-      const question = askAbout(error, stated, again) ?? (error.code === "size_mismatch" && askWindow(form.calibration, part));
-      if (!question) {
-        last = null;
-        throw error;
-      }
-      put(verdict, problem(error), question);
+      if (isAborted(error)) throw error;
+      const repeat = () => again(known);
+      put(verdict, problem(error), askAbout(error, stated, again, {
+        crop: () => askWindow(error, form, part, repeat),
+        mask: () => askExtent(form),
+      }));
       return;
     }
     const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale((full_scale) => again({ ...stated, full_scale }));
-    put(verdict, fits(form.measurement), doubt);
+    put(verdict, fits(form.measurement), doubt, askMove(form, part, () => again(known)));
     changed();
   };
   // A change of these fields repeats the request with the same file.
-  for (const input of [fps.input, exposure.input, sequence]) {
+  for (const input of [fps.input, exposure.input, saturation.input, sequence]) {
     input.addEventListener("change", () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
@@ -209,7 +252,7 @@ function measurementStep(form, changed, signal) {
   }, true);
   const inside = h("div", { hidden: true },
     h("div", { class: "fields" }, name.element, fps.element, exposure.element, h("label", { for: "sequence" }, "Sequence of snapshots", sequence)),
-    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row" }, darkList, forget))), part.element);
+    h("div", { class: "two" }, drop.element, h("div", null, dark.element, h("div", { class: "row below" }, darkList, forget))), part.element);
   const wake = () => {
     attempt += 1;
     inside.hidden = !form.calibration;
@@ -221,13 +264,6 @@ function measurementStep(form, changed, signal) {
     changed();
   };
   return { element: step(2, "Measurement", wait, inside, verdict), wake };
-}
-
-/** Offers a window of the snapshots with the size of the masks. */
-function askWindow({ height, width }, part) {
-  return h("div", { class: "askscale", role: "group", "aria-label": "Window" },
-    h("p", null, h("b", null, `Does the file hold a window of ${height} × ${width} pixels that the masks show?`), " Enter its first row and column below. Otherwise select the calibration of this camera setting above."),
-    h("div", { class: "row" }, h("button", { type: "button", class: "small", onclick: () => part.propose(height, width) }, `Use a window of ${height} × ${width}`)));
 }
 
 function fits(item) {
@@ -246,10 +282,11 @@ function fits(item) {
 function jobStep(algorithms, form, signal) {
   const select = h("select", { id: "algorithm" }, algorithms.map((item) => h("option", { value: item.name, selected: item.name === "pnp-tv-fastdvdnet" }, item.name)));
   const label = textField("label", "Name of the job", "drop of milk, first try");
-  const priority = numberField("priority", "Priority (−100 to 0; admins up to 100)", 1);
+  const registration = h("select", { id: "registration" }, [["", "corrected if it helps"], ["off", "not corrected"]].map(([value, text]) => h("option", { value }, text)));
+  const priority = numberField("priority", "Priority, −100 to 0", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
-  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth }) });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: form.truth, registration: registration.value || null }) });
   const ask = calmly(250, async () => {
     if (!form.measurement || signal.aborted) return;
     const asked = JSON.stringify(request());
@@ -268,27 +305,30 @@ function jobStep(algorithms, form, signal) {
   };
   const truth = dropZone("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, async (blob) => {
     form.truth = blob.sha256;
+    forget.hidden = false;
     ask();
   });
-  const forget = h("button", { type: "button", class: "small", onclick: () => {
+  const forget = h("button", { type: "button", class: "small below", hidden: true, onclick: () => {
     form.truth = null;
+    forget.hidden = true;
     truth.clear();
     ask();
   } }, "Remove the true frames");
   select.addEventListener("change", renew);
+  registration.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, priority.element), plan,
-    h("details", null, h("summary", null, "True frames"), truth.element, h("div", { class: "row" }, forget)), estimate);
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, h("label", { for: "registration" }, "Masks that have moved are", registration), priority.element), plan,
+    h("details", null, h("summary", null, "True frames"), truth.element, forget), estimate);
   queueMicrotask(renew);
   return { element, renew, request };
 }
 
 /** Estimated time, computation, memory and disk space of a job. */
 function costs(found) {
-  const when = found.eta_seconds === null ? "not before a worker is running" : `in up to about ${duration(found.eta_seconds)}`;
+  const when = found.eta_seconds === null ? "not before a worker is running" : `in up to about ${roughly(found.eta_seconds)}`;
   return facts([
     ["Done", `${when}${found.queue_position > 1 ? `, position ${found.queue_position} in the queue` : ""}`],
-    ["CPU time", `up to about ${duration(found.cpu_seconds)}, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
+    ["CPU time", `up to about ${roughly(found.cpu_seconds)}, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
     ["Memory", `at most ${bytes(found.worker_memory_bytes)}`],
     ["Disk", `at most ${bytes(found.disk_bytes)}`],
   ]);

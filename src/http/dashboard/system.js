@@ -84,7 +84,7 @@ function workers(found) {
   const row = (worker) => h("tr", null,
     h("th", { scope: "row" }, short(worker.id)), h("td", null, worker.pid), h("td", null, worker.version), h("td", null, worker.device ?? ""),
     h("td", null, task(worker.task)),
-    h("td", { title: momentInFull(worker.started_at) }, moment(worker.started_at)));
+    h("td", { class: "together", title: momentInFull(worker.started_at) }, moment(worker.started_at)));
   const heads = ["Worker", "Process", "Version", "Device", "Task", "Running since"].map((name) => h("th", { scope: "col" }, name));
   return card(title, h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Workers" },
     h("table", null, h("thead", null, h("tr", null, heads)), h("tbody", null, found.workers.map(row)))));

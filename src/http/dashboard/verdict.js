@@ -1,9 +1,9 @@
-// The card "Is it good?": findings of the checks, grade of the calibration, expected PSNR, and the PSNR and
-// SSIM against true frames if they are attached.
+// The card "Is it good?": findings of the checks, grade of the calibration, and the expected PSNR, or PSNR and SSIM
+// against true frames if they are attached.
 
 import { ask } from "./actions.js";
-import { aboutDecibels, bytes, expectedRange, figure, verdictOf } from "./format.js";
-import { h, put, say } from "./dom.js";
+import { aboutDecibels, axisOf, bytes, decibels, expectedRange, figure, measuredVerdict, verdictOf } from "./format.js";
+import { explained, h, put, say } from "./dom.js";
 import { findings } from "./report.js";
 import { isAborted, get, send, upload } from "./api.js";
 import { csvLink, plot } from "./plot.js";
@@ -11,7 +11,7 @@ import { csvLink, plot } from "./plot.js";
 /** The card; `show(job, manifest, snapshot)` updates it. The manifest is null until the snapshot is written. */
 export class Verdict {
   constructor(job, signal) {
-    Object.assign(this, { job, signal, truth: job.truth });
+    Object.assign(this, { job, signal, truth: job.truth, changed: () => {} });
     this.title = h("p", { class: "judgement" });
     this.why = h("p", { class: "muted" });
     this.found = h("div", null, findings(job.warnings));
@@ -51,14 +51,13 @@ export class Verdict {
       put(this.expected);
       return;
     }
-    this.showExpected(manifest.content?.assessment);
+    this.assessment = manifest.content?.assessment;
     if (this.truth) await this.compare(this.truth);
     else this.unmeasured();
   }
 
   /** Shows the expected PSNR from the manifest, with its interval and reasons. */
-  showExpected(assessment) {
-    this.assessment = assessment;
+  showExpected() {
     const { psnr_db: psnr, reasons } = this.assessment ?? {};
     const warned = new Set(this.job.warnings.map((warning) => warning.code));
     const own = reasons?.filter((reason) => !warned.has(reason.code)) ?? [];
@@ -80,6 +79,7 @@ export class Verdict {
     const [kind, , title, why] = verdictOf(this.job, this.assessment ?? null);
     this.judge(title, kind, why);
     put(this.measured);
+    this.showExpected();
   }
 
   /** Uploads true frames, compares them, and attaches them to the job for all its readers. */
@@ -89,7 +89,7 @@ export class Verdict {
       const { sha256 } = await upload(file, (done, total) => say(this.status, `${bytes(done)} of ${bytes(total)}`), this.signal);
       if (await this.compare(sha256)) await this.change(sha256);
     } catch (error) {
-      if (!isAborted(error)) put(this.status, h("span", { class: "warn" }, error.message));
+      if (!isAborted(error)) put(this.status, h("span", { class: "warn" }, explained(error)));
     }
   }
 
@@ -99,7 +99,7 @@ export class Verdict {
       await this.change(null);
       this.unmeasured();
     } catch (error) {
-      put(this.status, h("span", { class: "warn" }, error.message));
+      put(this.status, h("span", { class: "warn" }, explained(error)));
     }
   }
 
@@ -108,6 +108,7 @@ export class Verdict {
     this.truth = truth;
     this.attaching.hidden = truth !== null;
     this.removing.hidden = truth === null;
+    this.changed(truth);
   }
 
   /** Shows PSNR and SSIM against true frames; false if they could not be computed. */
@@ -118,28 +119,22 @@ export class Verdict {
       found = await get(`/v1/jobs/${this.job.id}/snapshots/${this.snapshot}/quality?truth=${truth}`, this.signal);
     } catch (error) {
       if (isAborted(error)) throw error;
-      put(this.status, h("span", { class: "warn" }, error.message));
+      put(this.status, h("span", { class: "warn" }, explained(error)));
       this.unmeasured();
       return false;
     }
     say(this.status, "");
-    const [text, kind, meaning] = LEVELS.find(([, , , least]) => (found.psnr ?? Infinity) >= least);
-    this.judge(found.psnr === null ? "Identical to the true frames" : text, kind, meaning);
-    const decibels = found.frames.map((frame) => frame.psnr ?? Infinity);
+    const [kind, , title, why] = measuredVerdict(found.psnr);
+    this.judge(title, kind, why);
+    put(this.expected);
+    const { spectral, name: xName, xs } = axisOf(this.job);
+    const curve = found.frames.map((frame) => frame.psnr ?? Infinity);
     const rows = found.frames.map((frame) => [frame.frame, frame.psnr ?? "inf", frame.ssim ?? ""]);
-    put(this.measured, h("p", { class: "quality" }, h("b", null, found.psnr === null ? "∞" : `${figure(found.psnr, 3)} dB`), " PSNR measured", found.ssim !== null && [", ", h("b", null, figure(found.ssim, 3)), " SSIM"]),
+    put(this.measured, h("p", { class: "quality" }, h("b", null, decibels(found.psnr)), " PSNR measured", found.ssim !== null && [", ", h("span", { class: "together" }, h("b", null, figure(found.ssim, 3)), " SSIM")]),
       h("p", { class: "muted" }, `Against the true frames of this job; mean of ${found.frames.length} frames, relative to the white level ${figure(found.peak)}.`),
-      h("details", { open: true }, h("summary", null, "PSNR frame by frame"),
-        decibels.length > 1 && decibels.every(Number.isFinite) && plot(decibels, { xName: "frame", yName: "PSNR in dB", first: 1, width: 270 }),
+      h("details", { open: true }, h("summary", null, spectral ? "PSNR band by band" : "PSNR frame by frame"),
+        curve.length > 1 && curve.every(Number.isFinite) && plot(curve, { xName, xs, yName: "PSNR in dB", width: 270 }),
         h("div", { class: "row" }, csvLink(`${this.job.id.slice(-8)}_${this.snapshot}_quality.csv`, ["frame", "psnr_db", "ssim"], rows))));
     return true;
   }
 }
-
-/** Verdicts on a measured PSNR, with their lower limits in dB in descending order. */
-const LEVELS = [
-  ["Excellent", "good", "35 dB or more: errors are hard to see.", 35],
-  ["Good", "good", "28 to 35 dB: expect softened detail.", 28],
-  ["Usable", "usable", "22 to 28 dB: expect lost texture.", 22],
-  ["Bad", "bad", "Less than 22 dB: expect only coarse shapes.", -Infinity],
-];

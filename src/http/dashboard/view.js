@@ -18,6 +18,13 @@ export class View {
     this.notify();
   }
 
+  /** Takes the size of another picture, and shows it whole. */
+  resize(height, width) {
+    if (this.height === height && this.width === width) return;
+    Object.assign(this, { height, width });
+    this.fit();
+  }
+
   notify() {
     this.listeners.forEach((listener) => listener());
   }

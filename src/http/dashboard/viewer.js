@@ -6,47 +6,67 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { figure, frameName } from "./format.js";
+import { axisOf, figure, frameName } from "./format.js";
 import { get, isUnreachable } from "./api.js";
 import { Probe } from "./probe.js";
 import { sampled } from "./values.js";
 
-const MODES = [["frame", "Frames"], ["difference", "Difference from the previous frame"], ["error", "Expected error"], ["residual", "Residual |y − Hx|"]];
+/** Pictures of the right pane: value, name, name for bands, and the meaning of dark and bright. */
+const MODES = [
+  ["frame", "Frames", "Bands", ""],
+  ["colours", "False colours", "All bands in false colours", "The shortest wavelength is blue, the middle green, the longest red. Equal bands are grey."],
+  ["difference", "Difference from the previous frame", "Difference from the previous band", "Middle grey: no change. Bright: more light than before."],
+  ["error", "Expected error", "Expected error", "Bright: a larger error is expected."],
+  ["deviation", "True error (frame − truth)", "True error (band − truth)", "Middle grey: equal to the true frame. Bright: too much light. Black: too little."],
+  ["residual", "Residual |y − Hx|", "Residual |y − Hx|", "Bright: the frames do not explain the measurement here."],
+];
+/** Pictures with values on both sides of 0, which is shown in middle grey. */
+const SIGNED = ["difference", "deviation"];
+/** Pictures that are the same for all frames. */
+const STILL = ["colours", "residual"];
+
+const capital = (text) => text.replace(/^./, (letter) => letter.toUpperCase());
 
 export class Viewer {
   constructor(job, signal) {
     const { frames, height, width } = job.shape;
-    Object.assign(this, { job, signal, snapshot: job.snapshots.first, spreads: new Map() });
+    Object.assign(this, { job, signal, snapshot: job.snapshots.first, spreads: new Map(), turn: 0 });
     this.view = new View(height, width);
-    this.right = new Pane("Frames", this.view, signal);
-    this.left = new Pane("Measurement", this.view, signal);
+    const spectral = job.dispersion !== null;
+    this.right = new Pane(spectral ? "Bands" : "Frames", this.view, signal);
+    // The measurement of a spectral camera is larger than a band.
+    this.left = new Pane("Measurement", spectral ? new View(height, width) : this.view, signal);
     this.leftContrast = new Contrast("measurement", () => this.showLeft());
     this.rightContrast = new Contrast("frames", () => this.showRight());
     this.player = new Player(frames, signal, () => this.showRight(), job.dispersion ? (frame) => frameName(job, frame) : undefined);
-    this.player.ahead = (frame) => this.mode() === "residual" || this.right.prepare(this.source(frame), ...this.rightContrast.window());
+    this.player.ahead = (frame) => STILL.includes(this.mode()) || this.right.prepare(this.source(frame), ...this.rightContrast.window());
     // With this box checked, playback of a sequence continues with the next snapshot.
     this.through = h("input", { type: "checkbox", id: "through" });
     this.player.onward = () => this.through.checked && this.goOn();
     if (job.snapshots.count > 1) this.player.element.lastChild.append(h("label", { for: "through", class: "row muted" }, this.through, "Play all snapshots"));
-    this.choice = h("select", { id: "mode", "aria-label": "Image" }, MODES.map(([value, text]) => h("option", { value }, text)));
+    this.choice = h("select", { id: "mode", "aria-label": "Image" }, MODES.map(([value, text, band]) => h("option", { value }, spectral ? band : text)));
+    this.offerMode("colours", Boolean(job.dispersion?.wavelengths));
+    this.setTruth(job.truth);
+    this.meaning = h("p", { class: "muted meaning", "aria-live": "polite" });
     this.choice.addEventListener("change", () => {
       this.rightContrast.touched = false;
+      if (STILL.includes(this.mode())) this.player.stop();
       this.offerRight();
     });
     this.slice = new Slice(this.view, frames, height, () => this.sliceBase(), () => this.frameWindow, signal);
     this.right.marks.push((context, target, scale) => this.slicing.open && this.slice.mark(context, target, scale));
     this.right.tools.append(this.choice, h("span", { class: "row" }, this.zoomTools()));
     this.left.element.append(this.leftContrast.element);
-    this.slicing = h("details", { class: "slicing" }, h("summary", null, "x–t slice"), this.slice.element);
+    this.slicing = h("details", { class: "slicing" }, h("summary", null, spectral ? "x–λ slice" : "x–t slice"), this.slice.element);
     this.slicing.addEventListener("toggle", () => this.showRight());
     this.fullScale = 1;
     const stack = () => ({ base: this.base(), height, width, version: this.right.generation });
-    const picture = () => this.ready && { ...stack(), base: this.source(this.player.frame).base };
-    this.probe = new Probe(this.right, frames, { picture, stack, frame: () => this.player.frame, unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
+    const picture = () => this.ready && { ...stack(), height: this.view.height, width: this.view.width, base: this.source(this.player.frame).base };
+    this.probe = new Probe(this.right, axisOf(job), { picture, stack, called: () => capital(frameName(job, this.player.frame)), unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
     for (const pane of [this.left, this.right]) pane.describe = (value) => this.words(value);
-    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.probe.element, this.slicing,
+    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.meaning, this.probe.element, this.slicing,
       h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
-        h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows a pixel through time. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.")));
+        h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`)));
     this.measured = null;
     this.beside = h("section", { class: "card viewer beside", "aria-label": "Measurement" }, this.left.element);
     this.player.keys(this.element);
@@ -89,6 +109,24 @@ export class Viewer {
     return this.choice.value;
   }
 
+  offerMode(mode, offered) {
+    const option = [...this.choice.options].find(({ value }) => value === mode);
+    option.hidden = option.disabled = !offered;
+    if (offered || this.mode() !== mode) return;
+    this.choice.value = "frame";
+    this.choice.dispatchEvent(new Event("change"));
+  }
+
+  /** Offers the true error if the job has true frames. */
+  setTruth(truth) {
+    if (this.truth === truth) return;
+    // The picture has the same URL for other true frames.
+    this.right.generation += 1;
+    this.spreads.clear();
+    this.truth = truth;
+    this.offerMode("deviation", truth !== null);
+  }
+
   nearer(factor) {
     const { zoom } = this.right.place();
     this.view.zoomBy(factor ?? 1 / zoom, zoom);
@@ -104,16 +142,22 @@ export class Viewer {
   }
 
   name(frame) {
-    if (this.mode() === "frame") return `frame-${frame}`;
-    if (this.mode() === "error") return `error-${frame}`;
+    if (STILL.includes(this.mode())) return this.mode();
     // The first frame has no previous one.
-    return this.mode() === "difference" ? `difference-${Math.max(2, frame)}` : "residual";
+    return `${this.mode()}-${this.mode() === "difference" ? Math.max(2, frame) : frame}`;
   }
 
   source(frame) {
     const name = this.name(frame);
     const called = (number) => frameName(this.job, number);
-    const label = { frame: `${called(frame).replace(/^./, (letter) => letter.toUpperCase())} of ${this.player.count}`, difference: `Difference of ${called(Math.max(2, frame))} from the previous one`, error: `Expected error of ${called(frame)}`, residual: "Residual map" }[this.mode()];
+    const label = {
+      frame: `${capital(called(frame))} of ${this.player.count}`,
+      colours: "All bands in false colours",
+      difference: `Difference of ${called(Math.max(2, frame))} from the previous one`,
+      error: `Expected error of ${called(frame)}`,
+      deviation: `True error of ${called(frame)}`,
+      residual: "Residual map",
+    }[this.mode()];
     return { base: `${this.base()}/${name}`, levels: this.levels, tile: this.tile, label };
   }
 
@@ -134,6 +178,7 @@ export class Viewer {
     const base = `/view/measurements/${this.job.measurement}/pictures/snapshot-${snapshot}`;
     try {
       const spread = await get(`${base}/spread`, this.signal);
+      this.left.view.resize(spread.height, spread.width);
       this.measured = { base, levels: spread.levels, tile: spread.tile, label: `Measurement, snapshot ${snapshot}` };
       this.left.setNote("");
       this.leftContrast.offer(spread);
@@ -176,20 +221,27 @@ export class Viewer {
       this.right.setNote("There is only one frame.");
       return;
     }
+    // A late answer must not undo a newer one.
+    const turn = (this.turn += 1);
     try {
       const spread = await this.spread();
+      if (turn !== this.turn) return;
       Object.assign(this, { levels: spread.levels, tile: spread.tile });
+      this.view.resize(spread.height, spread.width);
+      say(this.meaning, MODES.find(([value]) => value === this.mode())[3]);
       this.rightContrast.offer(spread);
       this.distribute(this.rightContrast, `${this.base()}/${this.name(Math.ceil(this.player.count / 2))}`, spread, this.right.generation);
     } catch (error) {
+      if (turn !== this.turn) return;
       if (!error.errors || isUnreachable(error)) throw error;
       this.ready = false;
       this.right.show(null);
       this.right.setNote(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "The job ended before any frame was computed." : "No frames yet. A coarse preview comes first, then the frames tile by tile.");
-      this.rightContrast.element.hidden = true;
+      this.rightContrast.element.hidden = this.player.element.hidden = true;
       return;
     }
     this.ready = true;
+    this.player.element.hidden = STILL.includes(this.mode());
     this.rightContrast.element.hidden = false;
     this.right.setNote("");
     this.showRight();
@@ -199,7 +251,9 @@ export class Viewer {
   async spread() {
     const name = this.name(Math.ceil(this.player.count / 2));
     if (!this.spreads.has(name)) this.spreads.set(name, await get(`${this.base()}/${name}/spread`, this.signal));
-    return this.spreads.get(name);
+    const spread = this.spreads.get(name);
+    const most = Math.max(-spread.low, spread.high);
+    return SIGNED.includes(this.mode()) ? { ...spread, low: -most, high: most } : spread;
   }
 
   /** Draws the histogram of a picture. */

@@ -1,6 +1,6 @@
 // The first screen: purpose, three steps, and a job with sample data.
 
-import { announce, h, put } from "./dom.js";
+import { announce, h, put, trouble } from "./dom.js";
 import { send } from "./api.js";
 import { WHAT } from "./signin.js";
 
@@ -39,7 +39,7 @@ export function welcome() {
       location.hash = `#/jobs/${made.job.id}`;
     } catch (error) {
       // A service without ONNX Runtime rejects networks; total variation needs none.
-      put(status, h("p", { class: "trouble", role: "alert" }, error.message),
+      put(status, trouble(error),
         !request.algorithm && h("button", { type: "button", onclick: () => submit({ algorithm: "gap-tv" }) }, "Try it without a network"));
       button.disabled = false;
     }

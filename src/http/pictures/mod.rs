@@ -1,5 +1,5 @@
-//! Pictures of frames, measurements and masks for viewers: 8-bit PNG of a display window, either reduced to a preview or
-//! in tiles at several zoom levels. The results have the exact values.
+//! Pictures of frames, measurements and masks for viewers: 8-bit PNG, WebP or JPEG of a display window, either reduced to
+//! a preview or in tiles at several zoom levels. The results have the exact values.
 
 mod names;
 mod source;
@@ -17,10 +17,11 @@ use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf};
+use super::negotiation::picture_encoding;
 use super::rendering::{self, Picture, Region, Spread, TILE};
 use engine::job::Sha256;
 use engine::pipeline::movie::DisplayWindow;
-use formats::png;
+use formats::display;
 
 /// Default length of the longer side of a preview, in pixels.
 const PREVIEW_SIDE: usize = 512;
@@ -166,7 +167,7 @@ fn display_window(black: f32, white: f32) -> Result<DisplayWindow> {
         .map_err(|error| ApiError::new(Code::InvalidQuery, error.to_string()))
 }
 
-/// Answers with a region of a picture as PNG. If the client has it, the answer is 304 and no values are read. Without a
+/// Answers with a region of a picture in the encoding that the client prefers. If the client has it, the answer is 304 and no values are read. Without a
 /// window, black and white are set so that half a percent of the pixels is below and above.
 async fn draw(
     app: &App,
@@ -175,10 +176,15 @@ async fn draw(
     window: Option<DisplayWindow>,
     headers: &HeaderMap,
 ) -> Result<Response> {
-    let content = format!("picture/1 {} {region:?} {window:?}", picture.identity);
+    let encoding = picture_encoding(headers)?;
+    let content = format!("picture/2 {} {region:?} {window:?} {encoding:?}", picture.identity);
     let etag = conditional::etag(&Sha256::of(content.as_bytes()));
     // The browser asks again before it shows a picture, so that it shows none after the end of a session.
-    let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "private, no-cache".into())];
+    let tags = [
+        (header::ETAG, etag.clone()),
+        (header::CACHE_CONTROL, "private, no-cache".into()),
+        (header::VARY, "accept".into()),
+    ];
     conditional::check_match(headers, &etag)?;
     if conditional::is_known(headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
@@ -190,8 +196,8 @@ async fn draw(
             let Spread { low, high, .. } = rendering::spread(&values);
             DisplayWindow { black: low, white: if high > low { high } else { low + 1.0 } }
         });
-        png::encode_u8(values.view(), channels, black, white)
+        display::Picture::new(values.view(), channels, (black, white))?.encode(encoding)
     });
     let bytes = encode.await.map_err(|error| ApiError::internal(&error))??;
-    Ok((tags, [(header::CONTENT_TYPE, "image/png")], bytes).into_response())
+    Ok((tags, [(header::CONTENT_TYPE, encoding.media_type())], bytes).into_response())
 }

@@ -6,7 +6,8 @@ use serde::Deserialize;
 use serde::de::DeserializeOwned;
 
 use super::source::{
-    Dispersed, Files, FinishedTile, Stack, Unfinished, expected_error, uploaded_frame,
+    Dispersed, Files, FinishedTile, Stack, TrueFrame, Unfinished, expected_error, nth_frame,
+    sent_frame,
 };
 use crate::http::app::App;
 use crate::http::error::{ApiError, Code, Result};
@@ -15,9 +16,11 @@ use crate::http::intake;
 use crate::http::jobs::with_snapshot;
 use crate::http::rendering::Picture;
 use crate::http::results::{result_file, white_level};
+use crate::http::truth;
+use engine::intake::IntakeError;
 use engine::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
 use engine::pipeline::records::TileTaskRecord;
-use formats;
+use formats::{self, Channels, FormatError};
 use store::{Calibration, Job, Measurement, StoreError, TileResult};
 
 /// The name of a picture of a job's snapshot.
@@ -32,6 +35,10 @@ enum JobPicture {
     Residual,
     /// `error-N`: the expected error of frame N, from 1.
     Error(usize),
+    /// `deviation-N`: frame N minus its true frame, from 1.
+    Deviation(usize),
+    /// `colours`: all bands of a spectral camera in false colours.
+    Colours,
     /// `slice-N`: row N of all frames, from 0.
     Slice(usize),
 }
@@ -72,12 +79,14 @@ impl TryFrom<String> for JobPicture {
         let number = |name| numbered(&text, name);
         let picture = match text.as_str() {
             "residual" => Some(Self::Residual),
+            "colours" => Some(Self::Colours),
             _ => (number("frame").map(Self::Frame))
                 .or_else(|| number("difference").map(Self::Difference))
                 .or_else(|| number("error").map(Self::Error))
+                .or_else(|| number("deviation").map(Self::Deviation))
                 .or_else(|| number("slice").map(Self::Slice)),
         };
-        let names = "pictures are frame-N, difference-N, error-N, slice-ROW and residual";
+        let names = "pictures are frame-N, difference-N, error-N, deviation-N, slice-ROW, colours and residual";
         picture.ok_or_else(|| names.into())
     }
 }
@@ -159,6 +168,15 @@ impl Named for OfJob {
             JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
             JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
             JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
+            JobPicture::Deviation(k) if (1..=frames).contains(&k) => {
+                Ok(stack.deviation(k - 1, true_frame(app, &job, snapshot, k - 1).await?))
+            }
+            JobPicture::Colours => stack.false_colours().ok_or_else(|| {
+                not_found(
+                    "only the bands of a spectral camera with known wavelengths have false colours"
+                        .into(),
+                )
+            }),
             JobPicture::Residual => {
                 let masks = app.store.calibration(lab, job.spec.calibration).await?;
                 let masks = masks_stack(app, &masks).await?;
@@ -180,13 +198,17 @@ impl Named for OfBlob {
         app.store.upload(lab, sha256).await?;
         let path = intake::upload(app, sha256).await?;
         let (limits, file) = (app.limits, path.clone());
-        let read_info = move || formats::open_stack(&file, &limits).map(|reader| *reader.info());
+        let read_info = move || formats::open_shown(&file, &limits).map(|reader| *reader.info());
         let info = tokio::task::spawn_blocking(read_info).await;
         let info = info.map_err(|error| ApiError::internal(&error))??;
         if !(1..=info.frames).contains(&frame) {
             return Err(not_found(format!("frames are counted from 1 to {}", info.frames)));
         }
-        Ok(uploaded_frame(path, limits, &info, sha256, frame))
+        let (identity, size) = (format!("{sha256} sent {frame}"), (info.height, info.width));
+        Ok(sent_frame(identity, size, Channels::Grey, move || {
+            let mut reader = formats::open_shown(&path, &limits)?;
+            nth_frame(frame, || reader.next_frame())
+        }))
     }
 }
 
@@ -297,6 +319,35 @@ async fn frames_stack(app: &App, job: &Job, snapshot: u32) -> Result<Stack> {
     Ok(Stack { shape, identity, files, mosaic, dispersion, white: None })
 }
 
+/// The true frame of frame `k`, from 0.
+///
+/// Errors: 404 if the job has no true frames.
+async fn true_frame(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<TrueFrame> {
+    let truth = job
+        .spec
+        .truth
+        .ok_or_else(|| not_found("the job has no true frames; attach them with PATCH".into()))?;
+    let (path, limits) = (intake::upload(app, truth).await?, app.limits);
+    let (shape, snapshot) = (job.spec.frame_shape(), snapshot as usize);
+    let open = move || truth::open(&path, (None, None), limits, shape);
+    let opened = tokio::task::spawn_blocking(open).await;
+    let (mut opened, channels) = opened.map_err(|error| ApiError::internal(&error))??;
+    let index = truth::frames_before(&opened, snapshot, shape) + k;
+    let identity = format!("{truth} true {index}");
+    let size = (shape.height, shape.width);
+    let picture = sent_frame(identity.clone(), size, channels, move || {
+        nth_frame(index + 1, || {
+            opened.next_frame().map_err(|error| match error {
+                IntakeError::Format { source, .. } => source,
+                error => FormatError::Internal(error.to_string()),
+            })
+        })
+    });
+    let whole = picture.whole(0);
+    let values = app.pictures.reduced(Arc::new(picture), whole).await?;
+    Ok(TrueFrame { identity, channels, values })
+}
+
 /// A picture of the expected error of frame `k`, from 0.
 async fn error_picture(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<Picture> {
     let SceneShape { height, width, .. } = job.spec.frame_shape();
@@ -318,6 +369,8 @@ mod tests {
         assert_eq!(job("slice-0"), Ok(JobPicture::Slice(0)));
         assert_eq!(job("residual"), Ok(JobPicture::Residual));
         assert_eq!(job("error-3"), Ok(JobPicture::Error(3)));
+        assert_eq!(job("deviation-3"), Ok(JobPicture::Deviation(3)));
+        assert_eq!(job("colours"), Ok(JobPicture::Colours));
         for bad in ["frame-01", "frame-+1", "frame", "frame-", "../x", "residual-1", "slice--1", ""]
         {
             assert!(job(bad).is_err(), "{bad}");

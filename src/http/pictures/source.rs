@@ -11,7 +11,7 @@ use ndarray::{Array2, Array3, Axis, s};
 use crate::http::rendering::Picture;
 use engine::job::{Dispersion, MARGIN, Mosaic, Sha256};
 use engine::pipeline::assessment::BLOCK;
-use formats::{self, Channels, FormatError, Limits, StackInfo, npy, planar};
+use formats::{self, Channels, FormatError, Limits, npy, planar};
 
 /// A stack of f32 \[frames, rows, columns\] that is read in windows.
 #[derive(Debug, Clone)]
@@ -34,6 +34,14 @@ pub(super) struct Stack {
 pub(super) struct Dispersed {
     pub(super) bands: Dispersion,
     pub(super) sensor: (usize, usize),
+}
+
+/// A true frame \[rows, columns\], or \[rows, 3 columns\] for colours.
+pub(super) struct TrueFrame {
+    /// Identifies the values, as in [`Picture::identity`].
+    pub(super) identity: String,
+    pub(super) channels: Channels,
+    pub(super) values: Arc<Array2<f32>>,
 }
 
 #[derive(Debug, Clone)]
@@ -193,6 +201,37 @@ impl Stack {
         })
     }
 
+    /// Frame `k`, from 0, minus the true frame. Colours are compared with colours, and sensor values with sensor values.
+    pub(super) fn deviation(&self, k: usize, truth: TrueFrame) -> Picture {
+        let TrueFrame { identity, channels, values } = truth;
+        let picture = self.picture(&format!("minus {identity}"), 2, move |stack, rows, columns| {
+            let samples = channels.count() * columns.start..channels.count() * columns.end;
+            let truth = values.slice(s![rows.clone(), samples]);
+            let as_stored = stack.channels() == channels;
+            let frame = if as_stored { Self::window } else { Self::raw };
+            Ok(first_frame(frame(stack, k..k + 1, rows, columns)?) - truth)
+        });
+        Picture { channels, ..picture }
+    }
+
+    /// All bands in false colours; `None` without wavelengths.
+    pub(super) fn false_colours(&self) -> Option<Picture> {
+        let shares = shares(self.dispersion.as_ref()?.bands.wavelengths.as_ref()?);
+        let bands = self.shape.0;
+        let picture = self.picture("false colours", bands, move |stack, rows, columns| {
+            let window = stack.window(0..bands, rows, columns)?;
+            let (_, height, width) = window.dim();
+            let mut colours = Array2::zeros((height, 3 * width));
+            for (band, shares) in window.outer_iter().zip(&shares) {
+                for (colour, share) in shares.iter().enumerate() {
+                    colours.slice_mut(s![.., colour..;3]).scaled_add(*share, &band);
+                }
+            }
+            Ok(colours)
+        });
+        Some(Picture { channels: Channels::Rgb, white: self.white, ..picture })
+    }
+
     /// One row of all frames: \[frames, columns\].
     pub(super) fn slice(&self, row: usize) -> Picture {
         let frames = self.shape.0;
@@ -264,30 +303,30 @@ fn each_band(
     Ok(stack)
 }
 
-/// A frame of an uploaded file, counted from 1. Most formats can only be read from the beginning, so the frame is read once
-/// and cached in the picture.
-pub(super) fn uploaded_frame(
-    path: PathBuf,
-    limits: Limits,
-    info: &StackInfo,
-    sha256: Sha256,
-    frame: usize,
+/// A frame of an uploaded file, which `read` returns. Most formats can only be read from the beginning, so the frame is read
+/// once and cached in the picture.
+pub(super) fn sent_frame(
+    identity: String,
+    (height, width): (usize, usize),
+    channels: Channels,
+    read: impl FnMut() -> Result<Array2<f32>, FormatError> + Send + 'static,
 ) -> Picture {
-    let cache: Mutex<Option<Array2<f32>>> = Mutex::default();
+    let source = Mutex::new((None, read));
     Picture {
-        height: info.height,
-        width: info.width,
-        identity: format!("{sha256} sent {frame}"),
-        channels: Channels::Grey,
-        depth: 1,
+        height,
+        width,
+        identity,
+        channels,
+        depth: channels.count(),
         white: None,
         read: Box::new(move |rows, columns| {
-            let mut cached = cache.lock().unwrap_or_else(PoisonError::into_inner);
-            let values = match &mut *cached {
+            let (cached, read) = &mut *source.lock().unwrap_or_else(PoisonError::into_inner);
+            let values: &Array2<f32> = match cached {
                 Some(values) => values,
-                empty => empty.insert(nth_frame(&path, &limits, frame)?),
+                empty => empty.insert(read()?),
             };
-            Ok(values.slice(s![rows, columns]).to_owned())
+            let samples = channels.count() * columns.start..channels.count() * columns.end;
+            Ok(values.slice(s![rows, samples]).to_owned())
         }),
     }
 }
@@ -322,13 +361,41 @@ pub(super) fn expected_error(
     }
 }
 
-fn nth_frame(path: &Path, limits: &Limits, frame: usize) -> Result<Array2<f32>, FormatError> {
-    let mut reader = formats::open_stack(path, limits)?;
-    let mut current = reader.next_frame()?;
-    for _ in 1..frame {
-        current = reader.next_frame()?;
+/// The last of the next `count` frames.
+pub(super) fn nth_frame(
+    count: usize,
+    mut next: impl FnMut() -> Result<Option<Array2<f32>>, FormatError>,
+) -> Result<Array2<f32>, FormatError> {
+    let mut current = next()?;
+    for _ in 1..count {
+        current = next()?;
     }
     current.ok_or_else(|| FormatError::io("read the frame")(ErrorKind::UnexpectedEof.into()))
+}
+
+/// Shares of the bands in red, green and blue. The shortest wavelength is blue, the longest red. Each colour is a weighted
+/// mean, so equal bands are grey.
+fn shares(wavelengths: &[f64]) -> Vec<[f32; 3]> {
+    let (shortest, longest) =
+        wavelengths.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &one| {
+            (low.min(one), high.max(one))
+        });
+    let span = (longest - shortest).max(f64::MIN_POSITIVE);
+    let share = |wavelength: &f64| {
+        let place = ((wavelength - shortest) / span) as f32;
+        [2.0 * place - 1.0, 1.0 - (2.0 * place - 1.0).abs(), 1.0 - 2.0 * place]
+            .map(|share| share.max(0.0))
+    };
+    let mut shares: Vec<[f32; 3]> = wavelengths.iter().map(share).collect();
+    for colour in 0..3 {
+        let sum: f32 = shares.iter().map(|share| share[colour]).sum();
+        for share in &mut shares {
+            // Few bands may leave a colour without one.
+            share[colour] =
+                if sum > 0.0 { share[colour] / sum } else { 1.0 / wavelengths.len() as f32 };
+        }
+    }
+    shares
 }
 
 fn first_frame(window: Array3<f32>) -> Array2<f32> {
@@ -403,10 +470,12 @@ fn overlay_tiles(
 mod tests {
     use std::sync::Arc;
 
-    use super::{Dispersed, Dispersion, Files, FinishedTile, Mosaic, Stack, Unfinished};
+    use super::{
+        Channels, Dispersed, Dispersion, Files, FinishedTile, Mosaic, Stack, TrueFrame, Unfinished,
+    };
     use engine::job::{DispersionAxis, MaskExtent};
     use formats::{npy, planar};
-    use ndarray::{Array3, Axis, s};
+    use ndarray::{Array2, Array3, Axis, s};
 
     fn prepared(folder: &std::path::Path, name: &str, stack: &Array3<f32>) -> std::path::PathBuf {
         let (frames, height, width) = stack.dim();
@@ -454,6 +523,17 @@ mod tests {
             assert_eq!(shown(&after), frame);
             assert_eq!(shown(&before), bands.unshear(sensor.index_axis(Axis(0), k), k));
         }
+        // Without wavelengths there are no colours. The middle band is green, the others are blue and red.
+        assert!(after.false_colours().is_none());
+        let mut named = bands.clone();
+        named.wavelengths = Some(vec![450.0, 550.0, 650.0]);
+        let dispersion = Some(Arc::new(Dispersed { bands: named, sensor: (10, 16) }));
+        let colours = Stack { dispersion, ..after.clone() }.false_colours().unwrap();
+        let colours = colours.reduce(&colours.whole(0)).unwrap();
+        for (colour, band) in [(0, 2), (1, 1), (2, 0)] {
+            assert_eq!(colours.slice(s![.., colour..;3]), cube.index_axis(Axis(0), band));
+        }
+        assert_eq!(super::shares(&[500.0, 500.0]), [[0.5; 3]; 2]);
         // The residual lies on the sensor.
         let y = sensor.sum_axis(Axis(0)).insert_axis(Axis(0));
         let measurement = stack((1, 10, 16), Files::Prepared(prepared(folder.path(), "y", &y)));
@@ -486,6 +566,14 @@ mod tests {
         }
         let slice = frames.slice(7);
         assert_eq!(slice.reduce(&slice.whole(0)).unwrap(), x.slice(s![.., 7, ..]));
+        let truth = TrueFrame {
+            identity: "t".into(),
+            channels: Channels::Grey,
+            values: Arc::new(x.index_axis(Axis(0), 1).to_owned() * 0.5),
+        };
+        let deviation = frames.deviation(1, truth);
+        let values = deviation.reduce(&deviation.whole(0)).unwrap();
+        assert_eq!(values, &x.index_axis(Axis(0), 1) * 0.5);
         let change = frames.difference(2);
         let values = change.reduce(&change.whole(0)).unwrap();
         assert_eq!(values, &x.slice(s![2, .., ..]) - &x.slice(s![1, .., ..]));
@@ -531,6 +619,14 @@ mod tests {
         let no_tiles = mosaic_stack(unfinished(Vec::new())).raw(0..1, 0..16, 0..20).unwrap();
         assert_eq!(no_tiles[[0, 14, 18]], coarse[[0, 0, 0]]);
         assert_eq!(no_tiles[[0, 9, 3]], coarse[[0, 1, 1]]);
+        // A truth has colours, or is as the sensor sees it.
+        for (channels, truth) in [(Channels::Rgb, &colours), (Channels::Grey, &raw)] {
+            let values = Arc::new(truth.index_axis(Axis(0), 1).to_owned());
+            let truth = TrueFrame { identity: "t".into(), channels, values };
+            let picture = assembled.deviation(1, truth);
+            let deviation = picture.reduce(&picture.whole(0)).unwrap();
+            assert_eq!(deviation, Array2::<f32>::zeros((16, 20 * channels.count())));
+        }
         let picture = assembled.frame(1);
         assert_eq!(picture.reduce(&picture.whole(0)).unwrap(), colours.slice(s![1, .., ..]));
     }

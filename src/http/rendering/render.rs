@@ -1,4 +1,5 @@
-//! Reduces regions of a picture by averaging blocks of pixels.
+//! Reduces regions of a picture by averaging blocks of pixels. The values are also measured, so they are not reduced by
+//! the `image` crate: for float32 its filters clip to \[0, 1\], and its thumbnails add a half.
 
 use std::ops::Range;
 

@@ -13,7 +13,8 @@ use crate::http::error::{ApiError, Code, Result};
 use crate::http::upload::{CHUNKS, Pace, next};
 use store::{Partial, PartialFile, Store, StoreError};
 
-/// Bytes of a piece with a checksum between two checks of the quotas. Other pieces are checked as they are recorded.
+/// Quotas are checked again after this number of bytes of a piece with a checksum. Other pieces are checked when they are
+/// recorded.
 const CHECKED_BYTES: u64 = 16 << 20;
 
 /// Bytes and time after which the offset is recorded: a crash of the service costs at most these.

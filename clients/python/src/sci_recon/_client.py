@@ -471,10 +471,14 @@ class Job(Entity):
         if assessment := self.record.get("assessment"):
             grade, psnr, low, high = (assessment[key] for key in ("grade", "psnr_db", "psnr_low_db", "psnr_high_db"))
             if psnr is None:
-                return f"{grade}, no expected PSNR"
-            if psnr < 40:
-                return f"{grade}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
-            return f"{grade}, expected PSNR 40 dB or more" + (f" ({low:.1f} or more)" if low < 40 else "")
+                text = f"{grade}, no expected PSNR"
+            elif psnr < 40:
+                text = f"{grade}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
+            else:
+                text = f"{grade}, expected PSNR 40 dB or more" + (f" ({low:.1f} or more)" if low < 40 else "")
+            if assessment.get("order") == "not_verifiable":
+                text += "; order of masks not verifiable: the scene moves too little or too fast"
+            return text
         return "bad" if any(finding["severity"] == "error" for finding in self.findings) else "not assessed"
 
     @property

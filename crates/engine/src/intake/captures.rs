@@ -7,16 +7,17 @@ use std::io::{BufWriter, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array2, Array3, Axis, s};
+use ndarray::{Array2, Array3, Axis};
 
 use super::IntakeError;
 use super::bad_pixels::bad_pixels;
 use crate::intake::error::Result;
 use crate::job::{CalibrationReport, Captures, Finding, MAX_CALIBRATION_SECONDS, planned_seconds};
+use formats::display::{Encoding, Picture};
 use formats::planar::{self, Reader};
 use formats::{
     self, Channels, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo,
-    StackWriter, png, read_stack,
+    StackWriter, read_stack,
 };
 use optics::{
     Average, Calibrator, CaptureFigures, Dispersion, MaskFigures, MaskStudy, PatternFigures,
@@ -329,18 +330,12 @@ fn read_patterns(files: &CaptureFiles, limits: &Limits) -> Result<Option<Array3<
     Ok(Some(patterns))
 }
 
-/// Encodes a map \[H,W\] as a PNG of at most [`PICTURE_SIDE`] pixels: block means, from black at 0 to white at the
-/// largest.
+/// Encodes a map \[H,W\] as a PNG of at most [`PICTURE_SIDE`] pixels, from black at 0 to white at the largest value.
 fn picture(map: &Array2<f32>) -> Result<Vec<u8>, FormatError> {
-    let (height, width) = map.dim();
-    let side = height.max(width).div_ceil(PICTURE_SIDE).max(1);
-    let small = Array2::from_shape_fn((height.div_ceil(side), width.div_ceil(side)), |(i, j)| {
-        let rows = i * side..((i + 1) * side).min(height);
-        let columns = j * side..((j + 1) * side).min(width);
-        map.slice(s![rows, columns]).mean().unwrap_or(0.0)
-    });
-    let largest = small.fold(0.0f32, |largest, &value| largest.max(value));
-    png::encode_u8(small.view(), Channels::Grey, 0.0, if largest > 0.0 { largest } else { 1.0 })
+    let largest = map.fold(0.0f32, |largest, &value| largest.max(value));
+    let white = if largest > 0.0 { largest } else { 1.0 };
+    let picture = Picture::new(map.view(), Channels::Grey, (0.0, white))?;
+    picture.within(PICTURE_SIDE).encode(Encoding::Png)
 }
 
 #[cfg(test)]

@@ -102,6 +102,7 @@ fn masks(masks: &MaskReport, report: &CalibrationReport) -> Markup {
 }
 
 fn captured(captures: &CaptureReport) -> Markup {
+    let figures = &captures.figures;
     let range = captures.dynamic_range_db.map(|db| format!("{db:.1} dB"));
     table(&[
         ("Light throughput", percent(captures.light_throughput)),
@@ -115,19 +116,19 @@ fn captured(captures: &CaptureReport) -> Markup {
             "Mean stored value of white, black, black with mask",
             format!(
                 "{:.1}, {:.1}, {}",
-                captures.white_level,
-                captures.black_level,
-                captures
+                figures.white_level,
+                figures.black_level,
+                figures
                     .black_with_mask_level
                     .map_or("none (Eq. 7)".into(), |level| format!("{level:.1}"))
             ),
         ),
-        ("Saturated pixels of the white image", share(captures.white_saturated)),
-        ("Illumination: darkest part over brightest part", share(captures.illumination_flatness)),
-        ("Pixels whose white is not above their black", percent(captures.denominator_not_positive)),
+        ("Saturated pixels of the white image", share(figures.white_saturated)),
+        ("Illumination: darkest part over brightest part", share(figures.illumination_flatness)),
+        ("Pixels whose white is not above their black", percent(figures.denominator_not_positive)),
         (
             "Pixels whose white is too little above their black",
-            percent(captures.denominator_too_dark),
+            percent(figures.denominator_too_dark),
         ),
     ])
 }
@@ -141,7 +142,7 @@ fn patterns(captures: &CaptureReport) -> Markup {
                 }
             } }
             tbody {
-                @for (index, pattern) in captures.patterns.iter().enumerate() {
+                @for (index, pattern) in captures.figures.patterns.iter().enumerate() {
                     tr {
                         th scope="row" { (index) }
                         td { (percent(pattern.light)) }

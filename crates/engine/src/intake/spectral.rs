@@ -1,44 +1,16 @@
 //! The masks of a spectral camera, which are one mask, displaced by band.
 
-use ndarray::Array2;
-
 use super::IntakeError;
 use crate::intake::error::Result;
 use crate::job::{Dispersion, MaskExtent};
-use formats::{FormatError, FrameReader, Limits, StackInfo};
-
-/// Reads the only mask of a file once, and returns it displaced by each offset.
-struct Sheared {
-    reader: Box<dyn FrameReader + Send>,
-    info: StackInfo,
-    dispersion: Dispersion,
-    mask: Option<Array2<f32>>,
-    band: usize,
-}
-
-impl FrameReader for Sheared {
-    fn info(&self) -> &StackInfo {
-        &self.info
-    }
-
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
-        if self.mask.is_none() {
-            self.mask = self.reader.next_frame()?;
-        }
-        let Some(mask) = self.mask.as_ref().filter(|_| self.band < self.dispersion.bands()) else {
-            return Ok(None);
-        };
-        self.band += 1;
-        Ok(Some(self.dispersion.shear_mask(mask.view(), self.band - 1)))
-    }
-}
+use formats::{FrameReader, Frames, Limits, StackInfo};
 
 /// The masks of all bands, made from the only mask of an open file. `name` is the name of the file in errors.
 ///
 /// Errors: [`IntakeError::Content`] for several masks, and for a mask that is too small; [`IntakeError::Format`] for masks
 /// above the limits.
 pub(super) fn sheared(
-    reader: Box<dyn FrameReader + Send>,
+    mut reader: Box<dyn FrameReader + Send>,
     dispersion: &Dispersion,
     limits: &Limits,
     name: &str,
@@ -66,8 +38,14 @@ pub(super) fn sheared(
     let checked = limits.check_shape(info.format, bands as u64, rows as u64, columns as u64);
     checked.map_err(IntakeError::format(name))?;
     let info = StackInfo { frames: bands, height: rows, width: columns, ..info };
-    let dispersion = dispersion.clone();
-    Ok(Box::new(Sheared { reader, info, dispersion, mask: None, band: 0 }))
+    let (dispersion, mut mask, mut next) = (dispersion.clone(), None, 0..bands);
+    Ok(Box::new(Frames::new(info, move || {
+        if mask.is_none() {
+            mask = reader.next_frame()?;
+        }
+        let band = mask.as_ref().zip(next.next());
+        Ok(band.map(|(mask, band)| dispersion.shear_mask(mask.view(), band)))
+    })))
 }
 
 /// Explains the size of a measurement behind masks of `sensor` pixels that were made with a dispersion.

@@ -12,9 +12,8 @@ use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 use super::text::{InvalidText, Sha256};
 
 /// A lab (tenant). Data belong to one lab and are invisible to all others.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, derive_more::Display)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, derive_more::Display, schemars::JsonSchema)]
 #[serde(transparent)]
-#[derive(schemars::JsonSchema)]
 #[schemars(rename = "LabName")]
 pub struct Lab(String);
 
@@ -44,24 +43,11 @@ impl FromStr for Lab {
 }
 
 /// The permissions of a token. Each role includes those before it.
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    PartialOrd,
-    Ord,
-    Serialize,
-    Display,
-    EnumString,
-    IntoStaticStr,
-    VariantArray,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Serialize, Display, EnumString, IntoStaticStr, VariantArray, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
 #[strum(parse_err_ty = InvalidText, parse_err_fn = unknown_role)]
-#[derive(schemars::JsonSchema)]
 pub enum Role {
     /// View the lab's data and download results.
     Read,

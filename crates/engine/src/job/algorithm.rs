@@ -8,12 +8,10 @@ use reconstruction::priors::registry::PriorName;
 use reconstruction::schedule::Schedule;
 
 /// A reconstruction algorithm.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr, VariantArray,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, IntoStaticStr, VariantArray, schemars::JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case", const_into_str)]
-#[derive(schemars::JsonSchema)]
 pub enum Algorithm {
     GapTv,
     /// GAP with total variation in space, and in time where the pilot finds a gain.

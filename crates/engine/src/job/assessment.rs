@@ -23,9 +23,8 @@ pub struct Assessment {
 }
 
 /// Evidence for the order of a snapshot's masks from its frames.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, schemars::JsonSchema,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum MaskOrder {
     /// The frames follow one another more steadily than with any two masks exchanged. The reversed order looks the same.

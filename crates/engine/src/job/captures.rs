@@ -21,9 +21,8 @@ pub fn planned_seconds(samples: u64, frames: usize, pixels: usize) -> f64 {
 }
 
 /// The captures of a calibration, as uploads or as paths. Each file holds one frame or several repeats.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 #[schemars(rename = "Captures")]
 pub struct Captures<T = Sha256> {
     /// For each pattern, in order: captures of the white board with the lithography mask in place.

@@ -1,12 +1,12 @@
 //! Identifiers: one type per kind of resource. All are version 7 UUIDs, so they sort by creation time.
 
-use std::borrow::Cow;
 use std::str::FromStr;
 
 use derive_more::Display;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 use uuid::Uuid;
+
+use super::text::text_schema;
 
 /// A text is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -14,16 +14,6 @@ use uuid::Uuid;
 pub struct InvalidId {
     /// The beginning of the text, at most 60 characters.
     pub text: String,
-}
-
-/// All identifiers have one form.
-fn id_schema() -> Schema {
-    json_schema!({
-        "type": "string",
-        "description": "A UUID in lower case with hyphens.",
-        "pattern": "^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$",
-        "example": "019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d",
-    })
 }
 
 macro_rules! identifiers {
@@ -41,15 +31,12 @@ macro_rules! identifiers {
             }
         }
 
-        impl JsonSchema for $name {
-            fn schema_name() -> Cow<'static, str> {
-                "Id".into()
-            }
-
-            fn json_schema(_: &mut SchemaGenerator) -> Schema {
-                id_schema()
-            }
-        }
+        text_schema!($name, "Id", {
+            "type": "string",
+            "description": "A UUID in lower case with hyphens.",
+            "pattern": "^[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}$",
+            "example": "019ae4f0-6e5c-7c3a-9d1e-0d5f0a1b2c3d",
+        });
 
         impl FromStr for $name {
             type Err = InvalidId;

@@ -29,13 +29,12 @@ pub use ids::{
 };
 pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
-pub use pool::{InvalidPool, Pool};
+pub use pool::Pool;
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
 pub use registration::{Registered, RegistrationRequest};
 pub use report::{
-    CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, PatternReport,
-    Severity,
+    CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, Severity,
 };
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
 pub use shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};

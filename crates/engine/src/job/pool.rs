@@ -1,13 +1,15 @@
 //! Pools of workers on other machines.
 
-use std::fmt;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use derive_more::Display;
+use serde_with::{DeserializeFromStr, SerializeDisplay};
+
+use super::text::InvalidText;
 
 /// The name of a worker pool. All workers of a pool have the same rights and receive the same kind of tiles.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Display, SerializeDisplay, DeserializeFromStr)]
 pub struct Pool(String);
 
 impl Pool {
@@ -21,43 +23,19 @@ impl Pool {
     }
 }
 
-/// A text is not a valid pool name.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "{0:?} is not a valid pool name: use 1 to {max} characters of a-z, 0-9 and -",
-    max = Pool::MAX_LENGTH
-)]
-pub struct InvalidPool(String);
-
 impl FromStr for Pool {
-    type Err = InvalidPool;
+    type Err = InvalidText;
 
-    fn from_str(text: &str) -> Result<Self, InvalidPool> {
+    fn from_str(text: &str) -> Result<Self, InvalidText> {
         let is_good = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
         if (1..=Self::MAX_LENGTH).contains(&text.len()) && text.bytes().all(is_good) {
             return Ok(Self(text.to_owned()));
         }
-        Err(InvalidPool(text.chars().take(60).collect()))
-    }
-}
-
-impl TryFrom<String> for Pool {
-    type Error = InvalidPool;
-
-    fn try_from(text: String) -> Result<Self, InvalidPool> {
-        text.parse()
-    }
-}
-
-impl From<Pool> for String {
-    fn from(pool: Pool) -> String {
-        pool.0
-    }
-}
-
-impl fmt::Display for Pool {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
+        Err(InvalidText::new(format!(
+            "{:?} is not a valid pool name: use 1 to {} characters of a-z, 0-9 and -",
+            text.chars().take(60).collect::<String>(),
+            Self::MAX_LENGTH
+        )))
     }
 }
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
 
-use optics::{CaptureFigures, MaskFigures, PatternFigures};
+use optics::{CaptureFigures, MaskFigures};
 pub use optics::{FindingCode, Severity};
 
 /// A problem that a check has found. [`FindingCode`] is the registry of all codes.
@@ -50,12 +50,10 @@ fn codes() -> Vec<&'static str> {
 }
 
 /// The grade of a calibration or a result.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, IntoStaticStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Serialize, Deserialize, IntoStaticStr, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case", const_into_str)]
-#[derive(schemars::JsonSchema)]
 pub enum Grade {
     /// No findings.
     Good,
@@ -131,38 +129,9 @@ pub struct CaptureReport {
     pub noise: Option<f64>,
     /// Dynamic range in dB: `deviation` of the masks over `noise`.
     pub dynamic_range_db: Option<f64>,
-    /// Mean of the white image.
-    pub white_level: f64,
-    /// Mean of the black image.
-    pub black_level: f64,
-    /// Mean of the black image with the lithography mask in place; `None` if Eq. 7 was used.
-    pub black_with_mask_level: Option<f64>,
-    /// Illumination of the darkest part over that of the brightest.
-    pub illumination_flatness: Option<f64>,
-    /// Share of saturated pixels of the white image.
-    pub white_saturated: Option<f64>,
-    /// Share of the pixels whose white is not above their black.
-    pub denominator_not_positive: f64,
-    /// Share of the pixels whose white is above their black, but by too little to divide by.
-    pub denominator_too_dark: f64,
-    pub patterns: Vec<PatternReport>,
-}
-
-/// Statistics of the captures of one pattern.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-pub struct PatternReport {
-    /// Mean share of the light of the white image.
-    pub light: f64,
-    /// Share of the pixels at or below 0.
-    pub not_positive: f64,
-    /// Share of the pixels below 0 by more than noise explains.
-    pub negative: f64,
-    /// Standard deviation of a mask value due to noise.
-    pub noise: Option<f64>,
-    /// Share of saturated pixels.
-    pub saturated: Option<f64>,
-    /// Relative change of the light during the repeats.
-    pub drift: f64,
+    /// Statistics of the captures. The noise of a pattern is that of its normalised mask.
+    #[serde(flatten)]
+    pub figures: CaptureFigures,
 }
 
 /// Name and version of the schema of [`CalibrationReport`].
@@ -237,32 +206,12 @@ impl CaptureReport {
         // The noise of the normalised masks.
         let noise = noise.map(|noise| noise.iter().sum::<f64>() / count / scale);
         let range = noise.filter(|noise| *noise > 0.0 && masks.deviation > 0.0);
-        Self {
-            light_throughput: figures.patterns.iter().map(|p| p.mean).sum::<f64>() / count,
-            mask_scale: scale,
-            noise,
-            dynamic_range_db: range.map(|noise| 20.0 * (masks.deviation / noise).log10()),
-            white_level: figures.white_level,
-            black_level: figures.black_level,
-            black_with_mask_level: figures.black_with_mask_level,
-            illumination_flatness: figures.flatness,
-            white_saturated: figures.white_saturated,
-            denominator_not_positive: figures.denominator_not_positive,
-            denominator_too_dark: figures.denominator_too_dark,
-            patterns: figures.patterns.iter().map(|p| PatternReport::new(p, scale)).collect(),
+        let light_throughput = figures.patterns.iter().map(|p| p.light).sum::<f64>() / count;
+        let dynamic_range_db = range.map(|noise| 20.0 * (masks.deviation / noise).log10());
+        let mut figures = figures.clone();
+        for pattern in &mut figures.patterns {
+            pattern.noise = pattern.noise.map(|noise| noise / scale);
         }
-    }
-}
-
-impl PatternReport {
-    fn new(figures: &PatternFigures, scale: f64) -> Self {
-        Self {
-            light: figures.mean,
-            not_positive: figures.not_positive,
-            negative: figures.negative,
-            noise: figures.noise.map(|noise| noise / scale),
-            saturated: figures.saturated,
-            drift: figures.drift,
-        }
+        Self { light_throughput, mask_scale: scale, noise, dynamic_range_db, figures }
     }
 }

@@ -1,9 +1,7 @@
 //! Job requests as users write them, and job specifications after all checks.
 
-use std::borrow::Cow;
-
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::{Deserialize, Serialize};
+use serde::de::{DeserializeOwned, Error};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
@@ -11,7 +9,7 @@ use super::model::{JobModel, ModelChoice};
 use super::registration::{Registered, RegistrationRequest};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
-use super::text::{InvalidField, Label};
+use super::text::{InvalidField, Label, text_schema};
 use super::webhook::Webhook;
 use super::{Dispersion, Sha256};
 use reconstruction::ReconError;
@@ -44,26 +42,18 @@ pub enum SnapshotSelection {
     Range(u32, u32),
 }
 
-impl JsonSchema for SnapshotSelection {
-    fn schema_name() -> Cow<'static, str> {
-        "Selection".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        let index = json_schema!({
-            "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX,
-        });
-        json_schema!({
-            "description": "All snapshots, one by its index from 0, or [first, last] with both ends included.",
-            "default": "all",
-            "anyOf": [
-                { "type": "string", "enum": ["all"] },
-                index,
-                { "type": "array", "minItems": 2, "maxItems": 2, "items": index },
-            ],
-        })
-    }
-}
+text_schema!(SnapshotSelection, "Selection", {
+    "description": "All snapshots, one by its index from 0, or [first, last] with both ends included.",
+    "default": "all",
+    "anyOf": [
+        { "type": "string", "enum": ["all"] },
+        { "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX },
+        {
+            "type": "array", "minItems": 2, "maxItems": 2,
+            "items": { "type": "integer", "format": "int64", "minimum": 0, "maximum": u32::MAX },
+        },
+    ],
+});
 
 #[derive(Serialize, Deserialize)]
 #[serde(untagged)]
@@ -99,9 +89,8 @@ impl From<SnapshotSelection> for SelectionJson {
 }
 
 /// The body of `POST /v1/jobs`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct JobRequest {
     pub measurement: MeasurementId,
     /// If stated, it must be the calibration of the measurement. It is a check, not a choice.
@@ -125,7 +114,11 @@ pub struct JobRequest {
     pub tile: Option<TileSpec>,
     /// `auto` estimates and corrects a displacement of the masks since the calibration, `{"shift": [rows, columns]}`
     /// states it in pixels, and `off` uses the masks as they were calibrated; by default `auto`.
-    #[serde(default, skip_serializing_if = "RegistrationRequest::is_auto")]
+    #[serde(
+        default,
+        deserialize_with = "or_default",
+        skip_serializing_if = "RegistrationRequest::is_auto"
+    )]
     pub registration: RegistrationRequest,
     /// Jobs of higher priority are served first. A priority above 0 needs the role admin.
     #[serde(default)]
@@ -363,6 +356,16 @@ impl JobSpec {
         let results = voxels * bytes + SNAPSHOT_BYTES;
         u64::from(self.snapshots.count) * results + self.snapshots_computed() * tiles * TILE_BYTES
     }
+}
+
+/// Reads a field whose null means the default. Another type is an error of this field: the JSON itself is sound.
+fn or_default<'de, T, D>(deserializer: D) -> Result<T, D::Error>
+where
+    T: Default + DeserializeOwned,
+    D: Deserializer<'de>,
+{
+    let value = Option::<serde_json::Value>::deserialize(deserializer)?;
+    value.map_or(Ok(T::default()), |value| serde_json::from_value(value).map_err(D::Error::custom))
 }
 
 #[cfg(test)]

@@ -35,9 +35,8 @@ impl SnapshotRange {
 
 /// Size and overlap of tiles in pixels; see [`reconstruction::tile::TilePlan::new`]. Behind a mosaic they count pixels
 /// of a sub-image.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 #[schemars(rename = "Tile")]
 pub struct TileSpec {
     /// Side of a tile.
@@ -56,12 +55,10 @@ impl TileSpec {
 }
 
 /// The temporal relation of the snapshots of a measurement.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, Display, EnumString, VariantNames,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, Display, EnumString, VariantNames, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[strum(serialize_all = "snake_case")]
-#[derive(schemars::JsonSchema)]
 pub enum Sequence {
     /// There is no pause between snapshots, so they may be reconstructed together.
     Contiguous,

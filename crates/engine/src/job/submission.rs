@@ -24,9 +24,8 @@ const EXPOSURE_TOLERANCE: f64 = 1e-3;
 const MODEL_S: f64 = 1.0;
 
 /// The body of `POST /v1/calibrations`: masks, the captures from which they are made, or a job that has corrected them.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 #[schemars(extend("anyOf" = [{ "required": ["masks"] }, { "required": ["captures"] }, { "required": ["registration_of"] }]))]
 pub struct CalibrationRequest {
     pub name: Option<Label>,
@@ -68,9 +67,8 @@ pub struct CalibrationRequest {
 }
 
 /// The body of `POST /v1/measurements`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct MeasurementRequest {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
@@ -111,9 +109,8 @@ pub struct MeasurementRequest {
 }
 
 /// The body of `POST /v1/models`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[derive(schemars::JsonSchema)]
 pub struct ModelRequest {
     pub name: Option<Label>,
     pub calibration: CalibrationId,
@@ -250,31 +247,32 @@ impl CalibrationRequest {
                 return wrong(&format!("/dispersion{}", error.pointer), &error.detail);
             }
         }
+        let not_with_captures = [
+            (self.array.is_some(), "/array", "captures are pictures, not named arrays"),
+            (self.axes.is_some(), "/axes", "captures are [frame, row, column]: leave axes out"),
+            (self.crop.is_some(), "/crop", "captures are used as a whole: crop the files"),
+            (
+                self.frames.is_some(),
+                "/frames",
+                "captures are used as a whole: list the files that are needed",
+            ),
+            (self.packing.is_some(), "/packing", "captures have one number per pixel"),
+            (
+                self.full_scale.is_some(),
+                "/full_scale",
+                "captures have no full scale: white and black give their masks' scale",
+            ),
+        ];
+        let mut not_with_captures = not_with_captures.iter().filter(|(is_given, ..)| *is_given);
         match (&self.masks, &self.captures) {
             (Some(_), None) if self.mosaic.is_some() && !keeps_mosaic(self.crop) => {
                 wrong("/crop", "the window of a mosaic starts at an even row and an even column")
             }
             (Some(_), None) => Ok(()),
-            (None, Some(_)) if self.array.is_some() => {
-                wrong("/array", "captures are pictures, not named arrays")
-            }
-            (None, Some(_)) if self.axes.is_some() => {
-                wrong("/axes", "captures are [frame, row, column]: leave axes out")
-            }
-            (None, Some(_)) if self.crop.is_some() => {
-                wrong("/crop", "captures are used as a whole: crop the files")
-            }
-            (None, Some(_)) if self.frames.is_some() => {
-                wrong("/frames", "captures are used as a whole: list the files that are needed")
-            }
-            (None, Some(_)) if self.packing.is_some() => {
-                wrong("/packing", "captures have one number per pixel")
-            }
-            (None, Some(_)) if self.full_scale.is_some() => wrong(
-                "/full_scale",
-                "captures have no full scale: white and black give their masks' scale",
-            ),
-            (None, Some(captures)) => captures.check(),
+            (None, Some(captures)) => match not_with_captures.next() {
+                Some((_, pointer, detail)) => wrong(pointer, detail),
+                None => captures.check(),
+            },
             _ => wrong("", "name either masks, captures or registration_of, one of them"),
         }
     }

@@ -1,17 +1,31 @@
 //! Validated text values: labels, hashes and times, and the errors of invalid ones.
 
-use std::borrow::Cow;
 use std::fmt;
 use std::io::{self, BufReader, Read};
 use std::str::FromStr;
 use std::time::Duration;
 
 use derive_more::Display;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Serialize;
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 
 use reconstruction::schedule::Schedule;
+
+/// Describes a type in JSON schemas: the type, the name of its schema, and the schema.
+macro_rules! text_schema {
+    ($type:ty, $name:literal, $schema:tt) => {
+        impl schemars::JsonSchema for $type {
+            fn schema_name() -> std::borrow::Cow<'static, str> {
+                $name.into()
+            }
+
+            fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+                schemars::json_schema!($schema)
+            }
+        }
+    };
+}
+pub(super) use text_schema;
 
 /// The error of a text that can't be parsed. It explains the expected form.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -64,21 +78,13 @@ impl Label {
     }
 }
 
-impl JsonSchema for Label {
-    fn schema_name() -> Cow<'static, str> {
-        "Label".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({
-            "type": "string",
-            "description": "A name for people, not blank and without control characters.",
-            "minLength": 1,
-            "maxLength": Self::MAX_CHARS,
-            "pattern": r"^[^\x00-\x1f\x7f-\x9f]*[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]*$",
-        })
-    }
-}
+text_schema!(Label, "Label", {
+    "type": "string",
+    "description": "A name for people, not blank and without control characters.",
+    "minLength": 1,
+    "maxLength": Self::MAX_CHARS,
+    "pattern": r"^[^\x00-\x1f\x7f-\x9f]*[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]*$",
+});
 
 impl FromStr for Label {
     type Err = InvalidText;
@@ -106,9 +112,8 @@ impl FromStr for Label {
 }
 
 /// The SHA-256 hash of a file, which is also its address in the store.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, SerializeDisplay, DeserializeFromStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(SerializeDisplay, DeserializeFromStr)]
 pub struct Sha256([u8; 32]);
 
 impl Sha256 {
@@ -142,19 +147,11 @@ impl fmt::Display for Sha256 {
     }
 }
 
-impl JsonSchema for Sha256 {
-    fn schema_name() -> Cow<'static, str> {
-        "Sha256".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({
-            "type": "string",
-            "pattern": "^[0-9a-f]{64}$",
-            "example": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
-        })
-    }
-}
+text_schema!(Sha256, "Sha256", {
+    "type": "string",
+    "pattern": "^[0-9a-f]{64}$",
+    "example": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+});
 
 impl FromStr for Sha256 {
     type Err = InvalidText;
@@ -173,22 +170,13 @@ impl FromStr for Sha256 {
 }
 
 /// A time in milliseconds since 1970-01-01T00:00:00Z. In JSON it is RFC 3339 text in UTC.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, SerializeDisplay, DeserializeFromStr,
-)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(SerializeDisplay, DeserializeFromStr)]
 pub struct Timestamp(pub i64);
 
-impl JsonSchema for Timestamp {
-    fn schema_name() -> Cow<'static, str> {
-        "Moment".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({
-            "type": "string", "format": "date-time", "example": "2026-11-21T10:39:01.000Z",
-        })
-    }
-}
+text_schema!(Timestamp, "Moment", {
+    "type": "string", "format": "date-time", "example": "2026-11-21T10:39:01.000Z",
+});
 
 impl FromStr for Timestamp {
     type Err = InvalidText;

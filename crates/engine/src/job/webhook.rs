@@ -1,14 +1,12 @@
 //! Addresses that are notified when a job ends.
 
-use std::borrow::Cow;
 use std::str::FromStr;
 
 use derive_more::Display;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 use url::Url;
 
-use super::text::InvalidText;
+use super::text::{InvalidText, text_schema};
 
 /// An address that is notified when a job ends: `https:` or `http:` with a host, without user name and password.
 #[derive(Debug, Clone, PartialEq, Eq, Display, SerializeDisplay, DeserializeFromStr)]
@@ -27,6 +25,23 @@ impl Webhook {
     pub fn is_allowed(&self, allowed: &[String]) -> bool {
         let place = self.place();
         allowed.iter().any(|host| host.eq_ignore_ascii_case(&place))
+    }
+
+    /// Reads a host that the administrator allows, without a default port.
+    ///
+    /// Errors: the text is not a name or an address with an optional port.
+    pub fn allowed_host(text: &str) -> Result<String, InvalidText> {
+        let url = format!("https://{text}/").parse::<Self>().ok().filter(|hook| {
+            let (url, has_star) = (&hook.0, text.contains('*'));
+            url.path() == "/" && url.query().is_none() && !has_star
+        });
+        let host = url.map(|hook| hook.place()).ok_or_else(|| {
+            InvalidText::new(format!(
+                "{text:?} is not a host: give a name or an address with an optional port, such as lab.example or \
+                 lab.example:8443"
+            ))
+        })?;
+        Ok(host.strip_suffix(":80").map(str::to_owned).unwrap_or(host))
     }
 
     /// The host, with the port unless it is the default one of the scheme.
@@ -59,22 +74,14 @@ impl FromStr for Webhook {
     }
 }
 
-impl JsonSchema for Webhook {
-    fn schema_name() -> Cow<'static, str> {
-        "Webhook".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({
-            "type": "string",
-            "format": "uri",
-            "description": "Address that is notified when the job ends. The administrator allows its host.",
-            "maxLength": Self::MAX_CHARS,
-            "pattern": "^https?://",
-            "example": "https://lab.example/hooks/sci-recon",
-        })
-    }
-}
+text_schema!(Webhook, "Webhook", {
+    "type": "string",
+    "format": "uri",
+    "description": "Address that is notified when the job ends. The administrator allows its host.",
+    "maxLength": Self::MAX_CHARS,
+    "pattern": "^https?://",
+    "example": "https://lab.example/hooks/sci-recon",
+});
 
 #[cfg(test)]
 mod tests {
@@ -92,6 +99,32 @@ mod tests {
         }
         let long = format!("https://lab.example/{}", "a".repeat(Webhook::MAX_CHARS));
         assert!(hook(&long).unwrap_err().to_string().contains("2000 characters"));
+    }
+
+    #[test]
+    fn an_allowed_host_is_a_host_with_an_optional_port() {
+        for (text, host) in [
+            ("lab.example", "lab.example"),
+            ("Lab.example:443", "lab.example"),
+            ("[::1]:9000", "[::1]:9000"),
+        ] {
+            assert_eq!(Webhook::allowed_host(text).unwrap(), host);
+        }
+        for text in [
+            "",
+            "https://lab.example/",
+            "lab.example/x",
+            "me@lab.example",
+            "*.example",
+            "a:99999",
+            "[::1",
+            "a?b",
+        ] {
+            assert!(
+                Webhook::allowed_host(text).unwrap_err().to_string().contains("is not a host"),
+                "{text}"
+            );
+        }
     }
 
     #[test]

@@ -10,7 +10,7 @@ use serde::{Serialize, Serializer};
 
 use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::networks::ModelRecord;
-use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, Summary, TileRecord};
+use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, TileRecord};
 use crate::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
     MeasurementId, Mosaic, Registered, ResultFile, SceneShape, Schedule, Sha256, TaskKind,
@@ -162,7 +162,7 @@ impl Recipe {
             height,
             width,
             snapshot,
-            summary: Summary::of(&tiles),
+            summary: TileRecord::summary(&tiles),
             assessment,
             tiles,
             files: Vec::new(),
@@ -233,7 +233,7 @@ pub struct Content {
     snapshot: usize,
     /// The records of all tiles of the snapshot, run by run, in the plan's order.
     tiles: Vec<TileRecord>,
-    pub summary: Summary,
+    pub summary: TileRecord,
     /// The predicted quality of the frames; null where there is no prediction.
     pub assessment: Option<Assessment>,
     camera: Option<CameraRecord>,
@@ -328,7 +328,7 @@ struct JobContent {
 #[derive(Debug, Serialize)]
 struct SnapshotEntry {
     snapshot: u32,
-    summary: Summary,
+    summary: TileRecord,
     assessment: Option<Assessment>,
     /// The files of the snapshot except its manifest, which has times that differ from run to run.
     files: Vec<ResultFile>,

@@ -10,9 +10,10 @@ use serde::{Deserialize, Serialize};
 use super::error::{PipelineError, Result};
 use super::progress::Monitor;
 use crate::job::{MovieFormat, SceneShape, Sha256, TaskStage, movie_step};
+use formats::display::Picture;
 use formats::gif::{self, GifWriter};
 use formats::movie::{self, Clip, MovieWriter};
-use formats::{Channels, FormatError, Limits, WindowReader, npy, png};
+use formats::{Channels, FormatError, Limits, WindowReader, npy};
 
 /// Number of samples that are read at a time: 16 MiB.
 const BAND_SAMPLES: usize = 4 << 20;
@@ -59,7 +60,7 @@ pub struct MovieTask {
 }
 
 /// Writes the movie to `path`, an existing empty file. Pictures with sides above [`crate::job::MOVIE_SIDE`] are
-/// averaged over blocks. One frame at a time is in memory.
+/// reduced. One frame at a time is in memory.
 ///
 /// Errors: [`PipelineError::Result`] if a file is damaged; I/O; a stop by the monitor.
 pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
@@ -153,41 +154,24 @@ fn levels(
         let end = (start + band).min(size.0);
         let rows = start * step..(end * step).min(height);
         let values = reader.read_window(k..k + 1, rows, 0..samples)?;
-        let values = block_means(values.index_axis_move(Axis(0), 0), channels, step);
-        levels.slice_mut(s![start..end, ..]).assign(&values.map(png::level_u8(black, white)));
+        let values = values.index_axis(Axis(0), 0);
+        let band = Picture::new(values, channels, (black, white))?.reduced(step).into_levels()?;
+        levels.slice_mut(s![start..end, ..]).assign(&band);
     }
     Ok(levels)
 }
 
-/// Means of blocks of `step` x `step` pixels. Blocks at the last row and column may be smaller.
-fn block_means(values: Array2<f32>, channels: Channels, step: usize) -> Array2<f32> {
-    if step == 1 {
-        return values;
-    }
-    let (height, samples) = values.dim();
-    let count = channels.count();
-    let width = samples / count;
-    Array2::from_shape_fn((height.div_ceil(step), width.div_ceil(step) * count), |(i, at)| {
-        let (j, channel) = (at / count, at % count);
-        let rows = i * step..((i + 1) * step).min(height);
-        let columns = j * step..((j + 1) * step).min(width);
-        let first = columns.start * count + channel;
-        let part = values.slice(s![rows, first..columns.end * count;count.cast_signed()]);
-        part.sum() / part.len() as f32
-    })
-}
-
 #[cfg(test)]
 mod tests {
-    use ndarray::{Array2, Array3, array, s};
+    use ndarray::Array3;
     use shiguredo_mp4::boxes::SampleEntry;
     use shiguredo_mp4::demux::{Input, Mp4FileDemuxer};
 
-    use super::{DisplayWindow, MovieTask, block_means, write};
+    use super::{DisplayWindow, MovieTask, write};
     use crate::job::{MovieFormat, SceneShape, Sha256};
     use crate::pipeline::PipelineError;
     use crate::pipeline::progress::Monitor;
-    use formats::{Channels, npy};
+    use formats::npy;
 
     #[test]
     fn large_pictures_are_reduced_and_damaged_files_refused() {
@@ -241,18 +225,6 @@ mod tests {
             (f32::MIN, f32::MAX),
         ] {
             assert!(DisplayWindow::new(black, white).is_err(), "{black} {white}");
-        }
-    }
-
-    #[test]
-    fn block_means_average_each_channel() {
-        let values = array![[1.0, 2.0, 3.0], [5.0, 6.0, 7.0], [9.0, 10.0, 11.0]];
-        assert_eq!(block_means(values, Channels::Grey, 2), array![[3.5, 5.0], [9.5, 11.0]]);
-        let colours = Array2::from_shape_fn((5, 21), |(i, j)| (100 * (j % 3) + i + j / 3) as f32);
-        let means = block_means(colours.clone(), Channels::Rgb, 4);
-        for c in 0..3 {
-            let grey = block_means(colours.slice(s![.., c..;3]).to_owned(), Channels::Grey, 4);
-            assert_eq!(means.slice(s![.., c..;3]), grey);
         }
     }
 }

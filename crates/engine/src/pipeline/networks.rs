@@ -1,7 +1,6 @@
 //! Networks: the embedded ones, those of a folder, users' end-to-end networks, and the libonnxruntime that runs them.
 
 use std::borrow::Cow;
-use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -16,6 +15,10 @@ use reconstruction::ReconError;
 use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
 use reconstruction::priors::onnx::{Device, EndToEndNetwork, Runtime};
 use reconstruction::priors::{Denoiser, Encoder, Network, Networks};
+#[cfg(feature = "gpu")]
+use reconstruction::{
+    gpu::adapter::Gpu, operator::SensingOperator, priors::registry::PriorSpec, solver::reconstruct,
+};
 
 /// A network embedded in the program as ONNX files, so that only libonnxruntime has to be installed.
 #[derive(Debug, Clone, Copy)]
@@ -186,12 +189,21 @@ pub struct NetworkSource {
     models: Option<PathBuf>,
     device: Device,
     version: Arc<OnceLock<String>>,
+    #[cfg(feature = "gpu")]
+    gpu: Arc<OnceLock<Result<Arc<Gpu>, ReconError>>>,
 }
 
 impl NetworkSource {
     /// A source that uses this libonnxruntime or, for `None`, the one that [`find_library`] finds.
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
-        Self { library, models: None, device, version: Arc::default() }
+        Self {
+            library,
+            models: None,
+            device,
+            version: Arc::default(),
+            #[cfg(feature = "gpu")]
+            gpu: Arc::default(),
+        }
     }
 
     /// Uses the networks in `folder`, which is organised like `models/`, instead of the embedded ones.
@@ -199,23 +211,24 @@ impl NetworkSource {
         Self { models: folder, ..self }
     }
 
-    /// The records of the networks that a schedule uses on this device.
+    /// The records of the networks that a schedule uses.
     pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
         let record = |network| {
             let contents = self.contents(network)?;
             Ok(ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref)))
         };
-        let networks: BTreeSet<_> =
-            schedule.networks().into_iter().map(|network| self.for_device(network)).collect();
-        networks.into_iter().map(record).collect()
+        schedule.networks().into_iter().map(record).collect()
     }
 
-    /// The variant of a network for the device. 8-bit networks are faster on CPUs only.
-    fn for_device(&self, network: Network) -> Network {
-        match (network, self.device) {
-            (Network::FastDvdNetInt8, Device::Gpu | Device::Cuda(_)) => Network::FastDvdNet,
-            _ => network,
-        }
+    /// A schedule with the precision of networks that suits this device.
+    #[must_use]
+    pub fn suited(&self, schedule: Schedule) -> Schedule {
+        if self.device == Device::Cpu { schedule } else { schedule.with_float_networks() }
+    }
+
+    /// The device for a network. GPUs have no operators for 8 bits, and results must not depend on the worker.
+    fn device_for(&self, network: Network) -> Device {
+        if network == Network::FastDvdNetInt8 { Device::Cpu } else { self.device }
     }
 
     /// The contents of the files of a network, in order.
@@ -228,9 +241,12 @@ impl NetworkSource {
         files.iter().map(content).collect()
     }
 
-    /// Name of the execution provider, for records.
-    pub fn provider(&self) -> &'static str {
-        self.device.provider()
+    /// Name of the execution provider of the networks of a schedule, for records: that of the GPU if any runs there. A schedule
+    /// without networks stands for an end-to-end network.
+    pub fn provider(&self, schedule: &Schedule) -> &'static str {
+        let mut devices = schedule.networks().into_iter().map(|network| self.device_for(network));
+        let is_on_cpu = schedule.needs_network() && devices.all(|device| device == Device::Cpu);
+        if is_on_cpu { Device::Cpu.provider() } else { self.device.provider() }
     }
 
     /// The device that runs the networks.
@@ -256,6 +272,46 @@ impl NetworkSource {
         })
     }
 
+    /// The GPU that runs stages of total variation, opened at the first call. `None` with `--device cpu` or `cuda:N`.
+    ///
+    /// # Errors
+    /// It can't be used.
+    #[cfg(feature = "gpu")]
+    pub fn gpu(&self) -> Result<Option<Arc<Gpu>>, ReconError> {
+        if self.device != Device::Gpu {
+            return Ok(None);
+        }
+        let opened = self.gpu.get_or_init(|| Gpu::open().map(Arc::new));
+        let opened = opened.as_ref().map_err(|error| ReconError::Runtime(error.to_string()))?;
+        Ok(Some(Arc::clone(opened)))
+    }
+
+    /// The GPU that runs the total variation of a schedule, for records. `None` if the CPU does.
+    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
+    pub fn gpu_name(&self, schedule: &Schedule) -> Option<String> {
+        #[cfg(feature = "gpu")]
+        if schedule.stages.iter().any(|stage| matches!(stage.prior, PriorSpec::Tv(_))) {
+            return Some(self.gpu().ok()??.name().to_owned());
+        }
+        None
+    }
+
+    /// Largest difference between the GPU and the CPU in a few iterations of total variation.
+    #[cfg(feature = "gpu")]
+    fn kernel_difference(&self) -> Result<f32, ReconError> {
+        let masks = Array3::from_shape_fn((3, 16, 16), |(k, i, j)| ((i * j + k) % 3) as f32 / 2.0);
+        let operator = SensingOperator::new(masks)?;
+        let ramp = Array3::from_shape_fn((3, 16, 16), |(k, i, j)| (k + i + j) as f32 / 32.0);
+        let y = operator.forward(ramp.view())?;
+        let schedule = Schedule::gap_tv3d().with_iterations(3);
+        let solve = |networks: &mut dyn Networks| {
+            let solved = reconstruct(&operator, y.view(), &schedule, networks, &mut ());
+            solved.map(|outcome| outcome.frames)
+        };
+        let on_gpu = solve(&mut WarmNetworks::new(self.clone()))?;
+        Ok(largest_difference(&on_gpu, &solve(&mut ())?))
+    }
+
     /// Largest difference between the device and the CPU in a pass of FFDNet over a small ramp.
     fn agreement(&self) -> Result<f32, String> {
         let text = |error: &dyn std::fmt::Display| error.to_string();
@@ -271,10 +327,9 @@ impl NetworkSource {
         };
         let on_device = pass(self.device).map_err(|error| text(&error))?;
         let on_cpu = pass(Device::Cpu).map_err(|error| text(&error))?;
-        let difference = on_device.iter().zip(&on_cpu).map(|(a, b)| (a - b).abs());
-        // `f32::max` would drop a NaN.
-        let largest =
-            difference.fold(0.0, |one: f32, other| if other <= one { one } else { other });
+        let largest = largest_difference(&on_device, &on_cpu);
+        #[cfg(feature = "gpu")]
+        let largest = largest + self.kernel_difference().map_err(|error| text(&error))?;
         if largest <= MAX_DIFFERENCE {
             return Ok(largest);
         }
@@ -294,7 +349,8 @@ impl NetworkSource {
 
     /// Loads a network with separate sessions for one thread.
     fn load(&self, network: Network) -> Result<ClipDenoiser, NetworkError> {
-        Ok(ClipDenoiser::load(&self.runtime()?, network, &self.contents(network)?)?)
+        let runtime = Runtime::open(&self.path()?, self.device_for(network))?;
+        Ok(ClipDenoiser::load(&runtime, network, &self.contents(network)?)?)
     }
 
     /// Loads the encoder with a separate session for one thread.
@@ -380,7 +436,6 @@ impl WarmNetworks {
 
 impl Networks for WarmNetworks {
     fn network(&mut self, network: Network) -> Result<&mut dyn Denoiser, ReconError> {
-        let network = self.source.for_device(network);
         let index = match self.loaded.iter().position(|(key, _)| *key == network) {
             Some(index) => index,
             None => {
@@ -403,6 +458,18 @@ impl Networks for WarmNetworks {
         };
         Ok(Some(self.encoder.insert(encoder)))
     }
+
+    #[cfg(feature = "gpu")]
+    fn gpu(&mut self) -> Result<Option<Arc<Gpu>>, ReconError> {
+        self.source.gpu()
+    }
+}
+
+/// Largest difference between two clips; NaN if any value is.
+fn largest_difference(one: &Array3<f32>, other: &Array3<f32>) -> f32 {
+    let differences = one.iter().zip(other).map(|(a, b)| (a - b).abs());
+    // `f32::max` would drop a NaN.
+    differences.fold(0.0, |one: f32, other| if other <= one { one } else { other })
 }
 
 fn existing(path: &Path) -> Option<PathBuf> {
@@ -463,15 +530,18 @@ mod tests {
     }
 
     #[test]
-    fn gpus_use_floating_point_networks() {
-        let schedule = Algorithm::PnpFastdvdnet.default_schedule();
-        let names = |device| -> Vec<String> {
-            let records = NetworkSource::new(None, device).records(&schedule).unwrap();
-            records.into_iter().map(|record| record.name).collect()
-        };
-        assert_eq!(names(Device::Cpu), ["fastdvdnet-gray", "fastdvdnet-gray-int8"]);
-        assert_eq!(names(Device::Cuda(0)), ["fastdvdnet-gray"]);
-        assert_eq!(names(Device::Gpu), ["fastdvdnet-gray"]);
+    fn the_schedule_decides_the_network_on_every_device() {
+        let algorithm = Algorithm::PnpTvFastdvdnet;
+        for device in [Device::Cpu, Device::Gpu, Device::Cuda(0)] {
+            let source = NetworkSource::new(None, device);
+            let name = |schedule| source.records(&schedule).unwrap().remove(0).name;
+            let (quick, exact) =
+                (algorithm.default_schedule(), algorithm.default_schedule().with_float_networks());
+            assert_eq!(source.provider(&quick), "CPUExecutionProvider");
+            assert_eq!(source.provider(&exact), device.provider());
+            assert_eq!(algorithm.misfit(&exact), None);
+            assert_eq!((&*name(quick), &*name(exact)), ("fastdvdnet-gray-int8", "fastdvdnet-gray"));
+        }
     }
 
     #[test]

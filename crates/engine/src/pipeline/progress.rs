@@ -79,20 +79,13 @@ impl Monitor {
 
     /// An observer of one run of a schedule that reports to this monitor.
     pub fn observe(&self, schedule: Schedule) -> impl Observer {
-        MonitorObserver {
-            monitor: self,
-            share: ShareDone::new(schedule),
-            part: 0.0..1.0,
-            passes: 0,
-        }
+        MonitorObserver { monitor: self, share: ShareDone::new(schedule), passes: 0 }
     }
 }
 
 struct MonitorObserver<'a> {
     monitor: &'a Monitor,
     share: ShareDone,
-    /// The part of the task, on \[0,1\], that the solver's run covers.
-    part: Range<f64>,
     passes: u32,
 }
 
@@ -109,15 +102,13 @@ impl Observer for MonitorObserver<'_> {
             stage: stage(progress.family),
             iterations: u32::try_from(progress.done).unwrap_or(u32::MAX),
             passes: self.passes,
-            fraction: self.part.start
-                + (self.part.end - self.part.start) * self.share.after(progress),
+            fraction: self.share.after(progress),
         });
         if self.monitor.stopped() { Control::Cancel } else { Control::Continue }
     }
 
     fn part(&mut self, share: Range<f64>) {
-        self.share.restart();
-        self.part = share;
+        self.share.restart(share);
         // A plot shows only the last run of the solver.
         *self.monitor.history.lock().unwrap_or_else(PoisonError::into_inner) = Default::default();
     }
@@ -132,22 +123,24 @@ fn stage(family: Family) -> TaskStage {
     }
 }
 
-/// Converts the solver's progress into the finished share of the planned cost.
+/// Converts the solver's progress into the finished share of the work, by the planned cost.
 #[derive(Debug, Clone)]
 pub(super) struct ShareDone {
     schedule: Schedule,
     stage: usize,
     iterations: usize,
+    /// The part of the work, on \[0,1\], that the solver's run covers.
+    part: Range<f64>,
 }
 
 impl ShareDone {
     pub(super) fn new(schedule: Schedule) -> Self {
-        Self { schedule, stage: 0, iterations: 0 }
+        Self { schedule, stage: 0, iterations: 0, part: 0.0..1.0 }
     }
 
-    /// Starts another run of the schedule.
-    pub(super) fn restart(&mut self) {
-        (self.stage, self.iterations) = (0, 0);
+    /// Starts another run of the schedule, which is this part of the work.
+    pub(super) fn restart(&mut self, part: Range<f64>) {
+        (self.stage, self.iterations, self.part) = (0, 0, part);
     }
 
     /// The share on \[0,1\] after the iteration in `progress`. Must be called for every iteration. The share jumps
@@ -157,7 +150,8 @@ impl ShareDone {
             (self.stage, self.iterations) = (progress.stage, 0);
         }
         self.iterations += 1;
-        self.schedule.share_done(self.stage, self.iterations)
+        let Range { start, end } = self.part;
+        start + (end - start) * self.schedule.share_done(self.stage, self.iterations)
     }
 }
 

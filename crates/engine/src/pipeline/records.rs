@@ -96,6 +96,7 @@ pub fn changes(decided: &Decided) -> String {
     changed.map(text).collect()
 }
 
+/// The iterations of a tile, or the largest values and the common reason of several tiles.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TileRecord {
     /// Iterations of all stages.
@@ -108,6 +109,21 @@ pub struct TileRecord {
     pub residual: f32,
     /// `converged` or `max-iterations`.
     pub stop_reason: String,
+}
+
+impl TileRecord {
+    /// Summary of tiles: the largest values, and `converged` if all tiles converged.
+    pub fn summary(tiles: &[Self]) -> Self {
+        let converged = tiles.iter().all(|tile| tile.stop_reason == "converged");
+        let most = |count: fn(&Self) -> usize| tiles.iter().map(count).max().unwrap_or(0);
+        Self {
+            iterations: most(|tile| tile.iterations),
+            tv_iterations: most(|tile| tile.tv_iterations),
+            denoiser_passes: most(|tile| tile.denoiser_passes),
+            residual: tiles.iter().map(|tile| tile.residual).fold(0.0, f32::max),
+            stop_reason: if converged { "converged" } else { "max-iterations" }.into(),
+        }
+    }
 }
 
 impl From<&Outcome> for TileRecord {
@@ -143,6 +159,9 @@ pub struct CostRecord {
     pub provider: Option<String>,
     /// Version of ONNX Runtime. `None` without a network.
     pub onnxruntime: Option<String>,
+    /// Name and driver of the GPU that ran stages of total variation. `None` if the CPU did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gpu: Option<String>,
     pub cpu_seconds: f64,
     /// Largest resident memory of a computing process.
     pub peak_rss_bytes: u64,
@@ -154,6 +173,7 @@ impl CostRecord {
         parts.fold(Self::default(), |sum, part| Self {
             provider: sum.provider.or_else(|| part.provider.clone()),
             onnxruntime: sum.onnxruntime.or_else(|| part.onnxruntime.clone()),
+            gpu: sum.gpu.or_else(|| part.gpu.clone()),
             cpu_seconds: sum.cpu_seconds + part.cpu_seconds,
             peak_rss_bytes: sum.peak_rss_bytes.max(part.peak_rss_bytes),
         })
@@ -180,38 +200,10 @@ impl RunRecord {
     }
 }
 
-/// Summary of a snapshot's tiles.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Summary {
-    /// Largest number of any tile.
-    pub iterations: usize,
-    /// Largest number of any tile.
-    pub tv_iterations: usize,
-    /// Largest number of any tile.
-    pub denoiser_passes: usize,
-    /// Largest value of the tiles.
-    pub residual: f32,
-    /// `converged` if all tiles converged, else `max-iterations`.
-    pub stop_reason: String,
-}
-
-impl Summary {
-    pub fn of(tiles: &[TileRecord]) -> Self {
-        let converged = tiles.iter().all(|tile| tile.stop_reason == "converged");
-        Self {
-            iterations: tiles.iter().map(|tile| tile.iterations).max().unwrap_or(0),
-            tv_iterations: tiles.iter().map(|tile| tile.tv_iterations).max().unwrap_or(0),
-            denoiser_passes: tiles.iter().map(|tile| tile.denoiser_passes).max().unwrap_or(0),
-            residual: tiles.iter().map(|tile| tile.residual).fold(0.0, f32::max),
-            stop_reason: if converged { "converged" } else { "max-iterations" }.into(),
-        }
-    }
-}
-
 /// The record of a snapshot's assembly.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct SnapshotRecord {
-    pub summary: Summary,
+    pub summary: TileRecord,
     #[serde(default)]
     pub assessment: Option<Assessment>,
     pub run: RunRecord,
@@ -221,7 +213,7 @@ pub struct SnapshotRecord {
 
 #[cfg(test)]
 mod tests {
-    use super::{Decided, Schedule, Summary, TileRecord, changes};
+    use super::{Decided, Schedule, TileRecord, changes};
     use reconstruction::pilot::StageEnd;
     use reconstruction::stage::Stage;
 
@@ -255,10 +247,10 @@ mod tests {
     #[test]
     fn a_summary_has_the_largest_values_of_the_tiles() {
         let tiles = [record(0.01, "converged", 20), record(0.03, "max-iterations", 24)];
-        let summary = Summary::of(&tiles);
+        let summary = TileRecord::summary(&tiles);
         assert_eq!((summary.denoiser_passes, summary.residual), (24, 0.03));
         assert_eq!(summary.iterations, 64);
         assert_eq!(summary.stop_reason, "max-iterations");
-        assert_eq!(Summary::of(&tiles[..1]).stop_reason, "converged");
+        assert_eq!(TileRecord::summary(&tiles[..1]).stop_reason, "converged");
     }
 }

@@ -7,6 +7,7 @@ use super::error::{PipelineError, Result};
 use super::progress::Monitor;
 use crate::job::SnapshotRange;
 use reconstruction::ReconError;
+use reconstruction::error::check_shape;
 use reconstruction::scale::ScaleEstimator;
 
 /// The solver's scale for snapshots \[S,H,W\] behind masks \[B,H,W\], both in memory.
@@ -15,13 +16,9 @@ use reconstruction::scale::ScaleEstimator;
 pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
     let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
     let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
-    let whites = lit_snapshots(whites)?;
-    let no_snapshots = || ReconError::Shape {
-        what: "the measurement",
-        found: "no snapshots".into(),
-        expected: "at least one".into(),
-    };
-    median_white(whites).ok_or_else(no_snapshots)
+    let white = median_white(lit_snapshots(whites)?);
+    check_shape(white.is_some(), "the measurement", "no snapshots", "at least one")?;
+    Ok(white.unwrap_or_default())
 }
 
 /// The solver's scale for the stored snapshots of a job. It reads one plane at a time. Snapshots without light do not count.

@@ -184,7 +184,7 @@ fn run_tiles(
                 Solver::Schedule(schedule) => {
                     let share = ShareDone::new(schedule.clone());
                     let report = |share| progress(index, share);
-                    let mut observer = TileObserver { report, stop: &stop, share, part: 0.0..1.0 };
+                    let mut observer = TileObserver { report, stop: &stop, share };
                     reconstruct_tile(window, schedule, &mut networks, &mut observer)?
                 }
                 Solver::Network(_) if stop.load(Ordering::Relaxed) => {
@@ -220,19 +220,16 @@ struct TileObserver<'a, F> {
     report: F,
     stop: &'a AtomicBool,
     share: ShareDone,
-    part: Range<f64>,
 }
 
 impl<F: Fn(f64)> Observer for TileObserver<'_, F> {
     fn iteration(&mut self, progress: &Progress) -> Control {
-        let Range { start, end } = self.part;
-        (self.report)(start + (end - start) * self.share.after(progress));
+        (self.report)(self.share.after(progress));
         if self.stop.load(Ordering::Relaxed) { Control::Cancel } else { Control::Continue }
     }
 
     fn part(&mut self, share: Range<f64>) {
-        self.share.restart();
-        self.part = share;
+        self.share.restart(share);
     }
 }
 

@@ -7,6 +7,7 @@ use ndarray::{Array3, Array4, ArrayView3, Axis, s};
 use super::residual::residual;
 use reconstruction::ReconError;
 use reconstruction::assessment::Model;
+use reconstruction::error::{check_parameter, check_shape};
 use reconstruction::evidence;
 use reconstruction::learned::SnapshotNetwork;
 use reconstruction::operator::SensingOperator;
@@ -36,22 +37,13 @@ impl TileInput {
     pub(super) fn on_unit_scale(
         self,
     ) -> Result<Option<(SensingOperator, Array3<f32>)>, ReconError> {
-        if !(self.white.is_finite() && self.white > 0.0) {
-            return Err(ReconError::Parameter {
-                name: "white level".into(),
-                value: self.white.to_string(),
-                range: "a finite number above 0".into(),
-            });
-        }
+        let is_level = self.white.is_finite() && self.white > 0.0;
+        check_parameter(is_level, "white level", self.white, "a finite number above 0")?;
         let snapshots = self.y.dim().0;
         let within = |piece: &Range<usize>| !piece.is_empty() && piece.end <= snapshots;
-        if !self.pieces.iter().all(within) {
-            return Err(ReconError::Shape {
-                what: "a tile",
-                found: format!("{snapshots} snapshots with the pieces {:?}", self.pieces),
-                expected: "non-empty pieces of these snapshots".into(),
-            });
-        }
+        let found = format!("{snapshots} snapshots with the pieces {:?}", self.pieces);
+        let expected = "non-empty pieces of these snapshots";
+        check_shape(self.pieces.iter().all(within), "a tile", found, expected)?;
         let masks = self.masks.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         let op = match SensingOperator::new(masks) {
             Err(ReconError::DarkMasks { .. }) => return Ok(None),

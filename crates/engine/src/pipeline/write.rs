@@ -12,7 +12,8 @@ use serde_json::Value;
 use super::error::{PipelineError, Result};
 use super::manifest::{Manifest, SCHEMA_FAMILY, frame_attributes};
 use crate::job::{ResultFile, Sha256};
-use formats::{Channels, exr, npy, png};
+use formats::display::Picture;
+use formats::{Channels, exr, npy};
 
 const FRAMES: &str = "frames";
 const PNGS: &str = "png";
@@ -75,7 +76,8 @@ pub fn write_result(
             frame = mosaic.demosaick(frame.view(), (0, 0));
         }
         exr::write_frame(&folder.join(frame_name(k)), frame.view(), channels, &attributes[k])?;
-        png::write_u16(&folder.join(png_name(k)), frame.view(), channels, 0.0, white)?;
+        Picture::with_16_bits(frame.view(), channels, (0.0, white))?
+            .write_png(&folder.join(png_name(k)))?;
         array.write_frame(frame.view())?;
         Ok::<_, PipelineError>(frame)
     })?;

@@ -9,6 +9,7 @@ use crate::array::{self, ArrayReader, RawSamples, Restart};
 use crate::axes::{Expected, Layout, Writer};
 use crate::error::Result;
 use crate::format::NPY_MAGIC;
+use crate::limits;
 use crate::samples::{self, ByteOrder};
 use crate::{Channels, Format, FormatError, Limits, SampleType, StackInfo, WindowReader};
 
@@ -126,14 +127,8 @@ fn read_header(file: &mut impl Read, length: u64) -> Result<(Header, u64)> {
             present: format!("{length} bytes in all"),
         });
     }
-    if header_bytes > MAX_HEADER_BYTES {
-        return Err(FormatError::OverLimit {
-            format: Format::Npy,
-            what: "the length of the header in bytes",
-            value: header_bytes,
-            limit: MAX_HEADER_BYTES,
-        });
-    }
+    let what = "the length of the header in bytes";
+    limits::check(Format::Npy, what, header_bytes, MAX_HEADER_BYTES)?;
     let mut text = vec![0; header_bytes as usize];
     fill(file, &mut text)?;
     Ok((Header::parse(&text)?, data_start))

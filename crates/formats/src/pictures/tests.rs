@@ -3,15 +3,19 @@ use ndarray::Array3;
 use proptest::prelude::{any, proptest};
 
 use super::Parts;
+use crate::display::{Encoding, Picture};
 use crate::npz::tests::archive;
 use crate::test_support::{assert_names, file, ramp, read, read_as, refusal, sample, survive};
-use crate::{Axes, Channels, Format, Limits, SampleType, open_stack, png};
+use crate::{Axes, Channels, Format, Limits, SampleType, open_stack};
 
 /// The frames as 8-bit PNG pictures.
 fn pictures(stack: &Array3<f32>) -> Vec<Vec<u8>> {
     stack
         .outer_iter()
-        .map(|frame| png::encode_u8(frame, Channels::Grey, 0.0, 255.0).unwrap())
+        .map(|frame| {
+            let picture = Picture::new(frame, Channels::Grey, (0.0, 255.0)).unwrap();
+            picture.encode(Encoding::Png).unwrap()
+        })
         .collect()
 }
 
@@ -127,12 +131,11 @@ fn tar_lengths_and_checksums_are_verified() {
     wrong[0] = b'b';
     assert_names(&refusal(&wrong), &["header at byte 0 is damaged"]);
     assert_names(&refusal(&whole[..530]), &["cut short"]);
-    // Long names are stored in separate members; links and folders are skipped.
+    // Long names are stored in separate members; folders are skipped.
     let long = format!("{}/a7.png", "folder".repeat(40));
     let pax = format!("{} path={long}\n", long.len() + 10);
     for (kind, name) in [(b'L', format!("{long}\0")), (b'x', pax)] {
         let bytes: Vec<u8> = [
-            tar_member("links", b'2', b""),
             tar_member("folder", b'5', b""),
             tar_member("name", kind, name.as_bytes()),
             tar_member("cut", b'0', &png),
@@ -142,8 +145,16 @@ fn tar_lengths_and_checksums_are_verified() {
     }
     let endless = tar_member("name", b'L', &vec![b'a'; 1 << 17]);
     assert_names(&refusal(&endless), &["a name of 131072 bytes"]);
-    let device = tar_member("sparse", b'S', b"");
-    assert_names(&refusal(&device), &["kind 'S'", "regular files"]);
+    let sparse = tar_member("sparse", b'S', b"");
+    assert_names(&refusal(&sparse), &["kind 'S'", "regular files"]);
+    // A member without content may be a frame that is missing.
+    for (kind, text) in [(b'1', "--hard-dereference"), (b'2', "a link"), (b'6', "a pipe")] {
+        let member = tar_member("a3.png", kind, b"");
+        assert_names(
+            &refusal(&[whole[..whole.len() - 1024].to_vec(), member].concat()),
+            &["a3.png", text],
+        );
+    }
 }
 
 #[test]

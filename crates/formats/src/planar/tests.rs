@@ -1,7 +1,10 @@
+use std::ops::Range;
+use std::path::Path;
+
 use ndarray::{Array3, s};
 use proptest::prelude::proptest;
 
-use super::{Reader, read_window, writer};
+use super::{Reader, writer};
 use crate::test_support::{assert_names, file, ramp};
 use crate::{FormatError, Limits};
 
@@ -12,6 +15,16 @@ fn planar(stack: &Array3<f32>) -> Vec<u8> {
         writer.write_frame(frame).unwrap();
     }
     writer.finish().unwrap()
+}
+
+fn read_window(
+    path: &Path,
+    frames: Range<usize>,
+    rows: Range<usize>,
+    columns: Range<usize>,
+    limits: &Limits,
+) -> Result<Array3<f32>, FormatError> {
+    Reader::open(path, limits)?.read_window(frames, rows, columns)
 }
 
 fn refusal(bytes: &[u8]) -> String {

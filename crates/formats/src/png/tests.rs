@@ -2,9 +2,9 @@ use ::png::{BitDepth, ColorType, Encoder};
 use ndarray::{array, s};
 use proptest::prelude::{any, proptest};
 
-use super::{encode_u16, write_u16};
+use crate::display::{Encoding, Picture};
 use crate::test_support::{assert_names, open, ramp, read, refusal, survive};
-use crate::{Channels, FormatError, Limits, SampleType, read_stack};
+use crate::{Channels, SampleType};
 
 fn png(color: ColorType, depth: BitDepth, width: u32, height: u32, data: &[u8]) -> Vec<u8> {
     let mut bytes = Vec::new();
@@ -20,9 +20,9 @@ fn png(color: ColorType, depth: BitDepth, width: u32, height: u32, data: &[u8]) 
 
 fn sixteen(height: usize, width: usize) -> Vec<u8> {
     let frame = ramp((1, height, width), 65536);
-    let mut bytes = Vec::new();
-    encode_u16(&mut bytes, frame.slice(s![0, .., ..]), Channels::Grey, (0.0, 65535.0)).unwrap();
-    bytes
+    let frame = frame.slice(s![0, .., ..]);
+    let picture = Picture::with_16_bits(frame, Channels::Grey, (0.0, 65535.0)).unwrap();
+    picture.encode(Encoding::Png).unwrap()
 }
 
 /// Length and checksum of a chunk.
@@ -45,19 +45,6 @@ fn grey_8_and_16_bit_values_are_read_as_stored() {
     let (info, stack) = read(&sixteen(300, 301)).unwrap();
     assert_eq!(info.sample, SampleType::U16);
     assert_eq!(stack, ramp((1, 300, 301), 65536));
-}
-
-#[test]
-fn levels_are_mapped_and_clipped() {
-    let path = tempfile::NamedTempFile::new().unwrap();
-    let frame = array![[-1.0, 0.0, 0.25], [0.5, 9.0, f32::NAN]];
-    write_u16(path.path(), frame.view(), Channels::Grey, 0.0, 0.5).unwrap();
-    let (_, stack) = read_stack(path.path(), &Limits::default()).unwrap();
-    assert_eq!(stack, array![[[0.0, 0.0, 32768.0], [65535.0, 65535.0, 0.0]]]);
-    for (black, white) in [(1.0, 1.0), (2.0, 1.0), (0.0, f32::NAN), (f32::NEG_INFINITY, 0.0)] {
-        let error = write_u16(path.path(), frame.view(), Channels::Grey, black, white).unwrap_err();
-        assert!(matches!(error, FormatError::Internal(_)), "{error}");
-    }
 }
 
 #[test]

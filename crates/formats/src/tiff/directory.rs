@@ -10,7 +10,7 @@ use super::ome;
 use super::refusal::{malformed, refused};
 use crate::error::Result;
 use crate::samples::ByteOrder;
-use crate::{Format, FormatError, Limits};
+use crate::{Format, FormatError, Limits, limits};
 
 /// Tags that this module reads.
 const NEW_SUBFILE_TYPE: u16 = 254;
@@ -215,13 +215,9 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
                 present: format!("{} bytes in all", self.length),
             });
         }
-        if count > MAX_VALUES && tag < FIRST_PRIVATE_TAG && tag != IMAGE_DESCRIPTION {
-            return Err(FormatError::OverLimit {
-                format: Format::Tiff,
-                what: "the number of values of a tag (strips, tiles)",
-                value: count,
-                limit: MAX_VALUES,
-            });
+        if tag < FIRST_PRIVATE_TAG && tag != IMAGE_DESCRIPTION {
+            let what = "the number of values of a tag (strips, tiles)";
+            limits::check(Format::Tiff, what, count, MAX_VALUES)?;
         }
         Ok(entry)
     }
@@ -265,30 +261,23 @@ impl<'a, R: Read + Seek> Layout<'a, R> {
         if size == 0 {
             return Ok(Vec::new());
         }
-        let bytes = entry.count.min(limit) * size;
-        let bytes = if entry.bytes <= entry.inline.len() as u64 {
-            entry.inline[..bytes as usize].to_vec()
-        } else {
-            self.read(entry.offset, bytes)?
-        };
+        let bytes = self.values(entry, entry.count.min(limit) * size)?;
         Ok(bytes.chunks_exact(size as usize).map(|number| self.number(number)).collect())
+    }
+
+    /// The first `bytes` bytes of the values of an entry.
+    fn values(&mut self, entry: &Entry, bytes: u64) -> Result<Vec<u8>> {
+        if entry.bytes <= entry.inline.len() as u64 {
+            return Ok(entry.inline[..bytes as usize].to_vec());
+        }
+        self.read(entry.offset, bytes)
     }
 
     /// The description of a page. Errors: a too long one.
     fn text(&mut self, entry: &Entry) -> Result<String> {
-        if entry.bytes > MAX_DESCRIPTION_BYTES {
-            return Err(FormatError::OverLimit {
-                format: Format::Tiff,
-                what: "the length of the description in bytes",
-                value: entry.bytes,
-                limit: MAX_DESCRIPTION_BYTES,
-            });
-        }
-        let bytes = if entry.bytes <= entry.inline.len() as u64 {
-            entry.inline[..entry.bytes as usize].to_vec()
-        } else {
-            self.read(entry.offset, entry.bytes)?
-        };
+        let what = "the length of the description in bytes";
+        limits::check(Format::Tiff, what, entry.bytes, MAX_DESCRIPTION_BYTES)?;
+        let bytes = self.values(entry, entry.bytes)?;
         let text = String::from_utf8_lossy(&bytes);
         Ok(text.trim_end_matches('\0').trim().to_owned())
     }

@@ -17,6 +17,8 @@ use ndarray::{Array3, Array4, ArrayView3};
 use schemars::Schema;
 
 use super::error::{ReconError, Result};
+#[cfg(feature = "gpu")]
+use super::gpu::adapter::Gpu;
 use super::projection::Projection;
 
 /// Frames, height and width of a clip.
@@ -180,6 +182,15 @@ pub trait Networks {
     /// # Errors
     /// It fails to load.
     fn encoder(&mut self) -> Result<Option<&mut dyn Encoder>> {
+        Ok(None)
+    }
+
+    /// The GPU that runs stages of total variation, opened at its first use. With none they run on the CPU.
+    ///
+    /// # Errors
+    /// It can't be used.
+    #[cfg(feature = "gpu")]
+    fn gpu(&mut self) -> Result<Option<std::sync::Arc<Gpu>>> {
         Ok(None)
     }
 }

@@ -11,12 +11,11 @@ use super::lease::{self, LONGEST_LEASE, Lease, Loss};
 use crate::Store;
 use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::tables::calibrations::Calibration;
 use crate::tables::jobs;
-use crate::tables::measurements::Measurement;
 use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
-use crate::tables::workers::{self, WorkerTakes};
+use crate::tables::things::{Calibration, Measurement};
+use crate::tables::workers::{self, Claimant};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Lab, MovieFormat, Registered,
     Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
@@ -104,21 +103,6 @@ pub struct MovieWork {
     pub arrays: Vec<(PathBuf, Sha256)>,
 }
 
-/// The claimant of a task, which decides what it may have.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Claimant<'a> {
-    /// A worker of this machine that does all there is.
-    Local,
-    /// One that leaves the tiles to other machines.
-    WithoutTiles,
-    /// One that takes short tasks alone, so that they wait for no tile. It begins no job: a job would be shown as
-    /// running though nobody computes it.
-    Light,
-    /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
-    /// run out.
-    Pool(&'a str),
-}
-
 /// The statement that looks for work: a task that is ready, or a lease that has expired. Parameters: now,
 /// [`LONGEST_PAUSE`], [`LONGEST_LEASE`].
 macro_rules! look_text {
@@ -198,15 +182,6 @@ macro_rules! take_text {
 
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
-    /// The tasks that a worker with these rights takes.
-    pub fn takes(self) -> WorkerTakes {
-        match self {
-            Self::Local | Self::Pool(_) => WorkerTakes::All,
-            Self::WithoutTiles => WorkerTakes::WithoutTiles,
-            Self::Light => WorkerTakes::ShortTasks,
-        }
-    }
-
     fn look(self) -> &'static str {
         match self {
             Self::Local => look_text!("", "tasks_ready"),
@@ -321,8 +296,8 @@ impl Store {
         type Record = Option<Json<Value>>;
         let (Json(spec), prepared, pilot, white): (Json<JobSpec>, Record, Record, Record) =
             facts.fetch_one(&self.readers).await?;
-        let calibration = self.find_calibration(None, spec.calibration).await?;
-        let measurement = self.find_measurement(None, spec.measurement).await?;
+        let calibration = self.thing_of_any_lab(spec.calibration).await?;
+        let measurement = self.thing_of_any_lab(spec.measurement).await?;
         let (mut tiles, mut records) = (Vec::new(), Vec::new());
         match kind {
             TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
@@ -352,7 +327,7 @@ impl Store {
         format: MovieFormat,
     ) -> Result<Work> {
         let job = self.job_of_any_lab(job).await?;
-        let measurement = self.find_measurement(None, job.spec.measurement).await?;
+        let measurement = self.thing_of_any_lab(job.spec.measurement).await?;
         let white: Option<Json<Value>> =
             sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job.id])
                 .fetch_one(&self.readers)
@@ -381,7 +356,7 @@ impl Store {
             None => (request.submission.calibration(), None),
         };
         let calibration = match calibration {
-            Some(id) => Some(self.find_calibration(None, id).await?),
+            Some(id) => Some(self.thing_of_any_lab(id).await?),
             None => None,
         };
         let registered = registered.flatten();
@@ -404,7 +379,8 @@ impl Store {
     async fn calibration_task(&self, id: CalibrationId) -> Result<Work> {
         let mut connection = self.readers.acquire().await?;
         let request = requests::find(&mut connection, id.into()).await?;
-        let masks = sql_as!("SELECT prepared FROM calibrations WHERE id = ?", [id]);
+        let masks = "SELECT prepared FROM requests WHERE id = ? AND prepared IS NOT NULL";
+        let masks = sql_as!(masks, [id]);
         let masks = masks.fetch_optional(&mut *connection).await?;
         let (captures, bad_pixels, spectral) = match request.submission {
             Submission::Calibration(request) => {

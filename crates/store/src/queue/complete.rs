@@ -10,16 +10,16 @@ use crate::columns::{Json, sql};
 use crate::error::{Result, StoreError};
 use crate::staging::{StagedBlob, StagedDir};
 use crate::tables::blobs::Origin;
-use crate::tables::calibrations::{self, NewCalibration};
-use crate::tables::measurements::{self, NewMeasurement};
 use crate::tables::reservations::reservations;
 use crate::tables::tasks::Owner;
-use crate::tables::{models, quota, reports, requests, results, sums};
+use crate::tables::things::{self, NewCalibration, NewMeasurement, NewModel};
+use crate::tables::{quota, reports, requests, results, sums};
 use crate::{Store, dir, on_files};
 use engine::intake::Refusal;
 use engine::job::{
-    Assessment, CalibrationId, CalibrationReport, JobId, ModelFacts, Registered, ResultFile,
-    Sha256, TaskKind, TaskProgress, TaskState, ThingId, Timestamp, planned_seconds,
+    Assessment, CalibrationId, CalibrationReport, JobId, MeasurementId, ModelId, Registered,
+    ResultFile, Sha256, Submission, TaskKind, TaskProgress, TaskState, ThingId, Timestamp,
+    planned_seconds,
 };
 
 #[derive(Debug)]
@@ -53,7 +53,7 @@ pub enum Checked {
     /// Masks can be made from the captures; the planned CPU-seconds.
     Captures(f64),
     Measurement(NewMeasurement, StagedBlob),
-    Model(ModelFacts),
+    Model(NewModel),
     Refused(Refusal),
 }
 
@@ -165,17 +165,21 @@ impl Store {
                 let prepared = staged.sha256();
                 let seconds = planned_seconds(0, facts.frames, facts.height * facts.width);
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                calibrations::insert_made(transaction, id.into(), prepared, facts).await?;
+                let files = (prepared, facts.masks);
+                things::record::<CalibrationId>(transaction, id.into(), files, &facts).await?;
                 seconds
             }
             Checked::Captures(seconds) => seconds,
             Checked::Measurement(facts, staged) => {
                 let prepared = staged.sha256();
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                return measurements::insert_made(transaction, id.into(), prepared, facts).await;
+                let files = (prepared, facts.data);
+                return things::record::<MeasurementId>(transaction, id.into(), files, &facts)
+                    .await;
             }
             Checked::Model(facts) => {
-                return models::insert_made(transaction, id.into(), &facts).await;
+                let files = (facts.file, facts.file);
+                return things::record::<ModelId>(transaction, id.into(), files, &facts).await;
             }
             Checked::Refused(refusal) => return requests::refuse(transaction, id, &refusal).await,
         };
@@ -216,7 +220,14 @@ impl Store {
         if let Some((facts, staged)) = done.masks {
             let prepared = staged.sha256();
             self.publish(transaction, staged, Origin::Prepared).await?;
-            calibrations::insert_made(transaction, id, prepared, facts).await?;
+            let Submission::Calibration(request) =
+                requests::find(transaction, id.into()).await?.submission
+            else {
+                return Err(StoreError::missing("calibration", id));
+            };
+            // The worker that makes masks knows nothing of colours.
+            let facts = NewCalibration { mosaic: request.mosaic, ..facts };
+            things::record(transaction, id, (prepared, facts.masks), &facts).await?;
         }
         if let Some(warning) = done.report.warning() {
             // A bad calibration causes other findings, so it comes first.

@@ -16,7 +16,7 @@ mod movie;
 mod progress;
 mod remote;
 
-pub use claim::{CalibrationTask, CheckTask, Claimant, ClaimedTask, JobTask, MovieWork, Work};
+pub use claim::{CalibrationTask, CheckTask, ClaimedTask, JobTask, MovieWork, Work};
 pub use complete::{CalibrationDone, Checked, Completion, Product};
 pub(super) use forecast::Forecasts;
 pub use lease::{Heartbeat, Lease, MAX_FAILURES, MAX_LOSSES, MAX_STARVED, WorkerEnd};

@@ -39,12 +39,20 @@ from_row!(BlobRow, row => { blob = Blob::from_row(row)?, in_use });
 /// The condition under which something of a lab refers to an upload of its, named as columns of `h`.
 macro_rules! in_use {
     () => {
-        "(EXISTS (SELECT 1 FROM calibrations AS c WHERE c.lab = h.lab AND masks = h.sha256)
-          OR EXISTS (SELECT 1 FROM measurements AS m WHERE m.lab = h.lab AND data = h.sha256)
-          OR EXISTS (SELECT 1 FROM request_files AS f JOIN requests USING (id)
-                     WHERE requests.lab = h.lab AND f.sha256 = h.sha256)
-          OR EXISTS (SELECT 1 FROM models AS m WHERE m.lab = h.lab AND file = h.sha256)
+        "(EXISTS (SELECT 1 FROM request_files AS f JOIN requests USING (id)
+                  WHERE requests.lab = h.lab AND f.sha256 = h.sha256)
           OR EXISTS (SELECT 1 FROM jobs AS j WHERE j.lab = h.lab AND truth = h.sha256))"
+    };
+}
+
+/// The condition under which no lab and no row refers to a file of `blobs`.
+macro_rules! unused {
+    () => {
+        "NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
+         AND NOT EXISTS (SELECT 1 FROM requests WHERE prepared = blobs.sha256)
+         AND NOT EXISTS (SELECT 1 FROM request_files AS f WHERE f.sha256 = blobs.sha256)
+         AND NOT EXISTS (SELECT 1 FROM jobs WHERE truth = blobs.sha256)
+         AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = blobs.sha256)"
     };
 }
 
@@ -188,15 +196,7 @@ impl Store {
         sha256: Sha256,
     ) -> Result<()> {
         let removed: Option<Timestamp> = sql_as!(
-            "DELETE FROM blobs WHERE sha256 = ?1
-                 AND NOT EXISTS (SELECT 1 FROM holdings WHERE sha256 = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM calibrations WHERE prepared = ?1 OR masks = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM measurements WHERE prepared = ?1 OR data = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM request_files WHERE sha256 = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM models WHERE file = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM jobs WHERE truth = ?1)
-                 AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = ?1)
-             RETURNING created_at",
+            concat!("DELETE FROM blobs WHERE sha256 = ? AND ", unused!(), " RETURNING created_at"),
             [sha256]
         )
         .fetch_optional(&mut *transaction)
@@ -225,15 +225,11 @@ impl Store {
         .fetch_all(&mut *transaction)
         .await?;
         let removed = sql_as!(
-            "DELETE FROM blobs WHERE touched_at < ?
-               AND NOT EXISTS (SELECT 1 FROM holdings AS h WHERE h.sha256 = blobs.sha256)
-               AND NOT EXISTS (SELECT 1 FROM calibrations WHERE masks = sha256 OR prepared = sha256)
-               AND NOT EXISTS (SELECT 1 FROM measurements WHERE data = sha256 OR prepared = sha256)
-               AND NOT EXISTS (SELECT 1 FROM request_files AS f WHERE f.sha256 = blobs.sha256)
-               AND NOT EXISTS (SELECT 1 FROM models WHERE file = sha256)
-               AND NOT EXISTS (SELECT 1 FROM jobs WHERE truth = sha256)
-               AND NOT EXISTS (SELECT 1 FROM tasks WHERE result = sha256)
-             RETURNING sha256, created_at",
+            concat!(
+                "DELETE FROM blobs WHERE touched_at < ? AND ",
+                unused!(),
+                " RETURNING sha256, created_at"
+            ),
             [before]
         );
         let removed: Vec<(Sha256, Timestamp)> = removed.fetch_all(&mut *transaction).await?;

@@ -228,13 +228,12 @@ impl Store {
 }
 
 /// Things that keep a lab from being removed, each with the query that counts those of one lab.
-const BELONGINGS: [(&str, &str); 8] = [
+const BELONGINGS: [(&str, &str); 7] = [
     ("tokens", "SELECT count(*) FROM tokens WHERE lab = ? AND revoked_at IS NULL"),
     ("jobs", "SELECT count(*) FROM jobs WHERE lab = ?"),
-    ("measurements", "SELECT count(*) FROM measurements WHERE lab = ?"),
-    ("calibrations", "SELECT count(*) FROM calibrations WHERE lab = ?"),
-    ("networks", "SELECT count(*) FROM models WHERE lab = ?"),
-    ("checks of files", "SELECT count(*) FROM requests WHERE lab = ?"),
+    ("measurements", "SELECT count(*) FROM requests WHERE lab = ? AND what = 'measurement'"),
+    ("calibrations", "SELECT count(*) FROM requests WHERE lab = ? AND what = 'calibration'"),
+    ("networks", "SELECT count(*) FROM requests WHERE lab = ? AND what = 'model'"),
     ("uploads", "SELECT count(*) FROM holdings WHERE lab = ?"),
     (
         "uploads that are not complete",

@@ -1,13 +1,10 @@
 //! The tables: one file for each kind of row.
 
 pub(super) mod blobs;
-pub(super) mod calibrations;
 mod changes;
 pub(super) mod jobs;
 pub(super) mod keys;
 pub(super) mod labs;
-pub(super) mod measurements;
-pub(super) mod models;
 mod notifications;
 pub(super) mod partials;
 pub(super) mod quota;
@@ -17,25 +14,27 @@ pub(super) mod reservations;
 pub(super) mod results;
 pub(super) mod sums;
 pub(super) mod tasks;
+pub(super) mod things;
 mod tokens;
 mod totals;
 pub(super) mod workers;
 
 pub use blobs::{Blob, BlobRow, Origin};
-pub use calibrations::{Calibration, NewCalibration};
 pub use changes::{Change, Changes};
 pub use jobs::{Job, JobChanges, JobFilter};
 pub use keys::{Inserted, Made, RequestKey};
 pub use labs::{Entitlement, LabFigures, LabRow, LabUse, share_error};
-pub use measurements::{Measurement, NewMeasurement};
-pub use models::{Model, NewModel};
 pub use notifications::{Delivery, Notification};
 pub use partials::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile};
-pub use requests::{Asked, Request};
+pub use requests::Request;
 pub use reservations::Reservations;
 pub use tasks::{
     FailedTask, FailureCause, TaskCounts, TaskRecord, TaskTotals, TileHistory, TileResult,
     TileState,
 };
+pub use things::{
+    Asked, Calibration, Measurement, Model, NewCalibration, NewMeasurement, NewModel, Resource,
+    Thing,
+};
 pub use tokens::Token;
-pub use workers::{WorkerPlace, WorkerRow, WorkerTakes, WorkerTask};
+pub use workers::{Claimant, WorkerPlace, WorkerRow, WorkerTask};

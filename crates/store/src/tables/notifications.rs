@@ -15,7 +15,7 @@ pub struct Notification {
     /// Distinguishes the ends of a job that was retried.
     pub id: i64,
     pub job: JobId,
-    /// Attempts so far.
+    /// Attempts so far, with the present one.
     pub attempts: u32,
 }
 
@@ -35,33 +35,52 @@ pub struct Delivery {
 from_row!(Delivery, row => { attempts, next_at, error });
 
 impl Store {
-    /// Up to `limit` notifications whose time has come, the oldest first.
-    pub async fn due_notifications(&self, limit: u32) -> Result<Vec<Notification>> {
-        let due = sql_as!(
-            "SELECT id, job, attempts FROM notifications WHERE next_at <= ? ORDER BY next_at, id LIMIT ?",
-            [Timestamp::now(), limit]
-        );
-        due.fetch_all(&self.readers).await
+    /// Takes up to `most` notifications whose time has come, and up to `most_of_lab` of each lab; labs take turns. Their
+    /// attempts are recorded before they are sent, so that none is repeated without a pause when the database fails.
+    /// `next_at` gives the time of the attempt after the next, by the number of those so far; `None` gives up.
+    pub async fn take_notifications(
+        &self,
+        most: usize,
+        most_of_lab: u32,
+        next_at: impl Fn(u32) -> Option<Timestamp>,
+    ) -> Result<Vec<Notification>> {
+        const DUE: &str = "
+            SELECT id, job, attempts + 1 AS attempts FROM (
+                SELECT n.*, row_number() OVER (PARTITION BY jobs.lab ORDER BY n.next_at, n.id) AS turn
+                FROM notifications n JOIN jobs ON jobs.id = n.job WHERE n.next_at <= ?1
+            ) WHERE turn <= ?2 ORDER BY turn, next_at, id LIMIT ?3";
+        let (now, most) = (Timestamp::now(), most as u64);
+        let due: Vec<Notification> =
+            sql_as!(DUE, [now, most_of_lab, most]).fetch_all(&self.readers).await?;
+        if due.is_empty() {
+            return Ok(due);
+        }
+        let mut transaction = self.write().await?;
+        for Notification { id, attempts, .. } in &due {
+            sql!(
+                "UPDATE notifications SET attempts = ?, next_at = ? WHERE id = ?",
+                [*attempts, next_at(*attempts), *id]
+            )
+            .execute(&mut *transaction)
+            .await?;
+        }
+        transaction.commit().await?;
+        Ok(due)
     }
 
     /// Removes a notification that was received. One about a later end of the same job stays.
     pub async fn notified(&self, id: i64) -> Result<()> {
-        sql!("DELETE FROM notifications WHERE id = ?", [id]).execute(&self.writer).await?;
+        sql!("DELETE FROM notifications WHERE id = ?", [id]).execute(self.writer()?).await?;
         Ok(())
     }
 
-    /// Records a failed attempt. The next one is at `next_at`; `None` gives up.
-    pub async fn not_notified(
-        &self,
-        id: i64,
-        error: &str,
-        next_at: Option<Timestamp>,
-    ) -> Result<()> {
+    /// Records why an attempt failed. If it `is_final`, the notification is given up.
+    pub async fn not_notified(&self, id: i64, error: &str, is_final: bool) -> Result<()> {
         sql!(
-            "UPDATE notifications SET attempts = attempts + 1, error = ?, next_at = ? WHERE id = ?",
-            [error, next_at, id]
+            "UPDATE notifications SET error = ?, next_at = iif(?, NULL, next_at) WHERE id = ?",
+            [error, is_final, id]
         )
-        .execute(&self.writer)
+        .execute(self.writer()?)
         .await?;
         Ok(())
     }

@@ -67,8 +67,7 @@ async fn token_bytes(connection: &mut SqliteConnection, token: TokenId) -> Resul
               + (SELECT coalesce(sum(coalesce(length, received)), 0) FROM partials
                  WHERE token = ?1 AND result IS NULL)
               + (SELECT coalesce(sum(size), 0) FROM blobs
-                 WHERE sha256 IN (SELECT prepared FROM calibrations WHERE token = ?1
-                                  UNION SELECT prepared FROM measurements WHERE token = ?1))
+                 WHERE sha256 IN (SELECT prepared FROM requests WHERE token = ?1 AND what <> 'model'))
               + (SELECT coalesce(sum(prepared_bytes), 0) FROM requests
                  WHERE token = ?1 AND prepared_bytes > 0)",
         [token]

@@ -1,10 +1,8 @@
 //! Table `requests`: calibrations, measurements and models as labs asked for them.
 //!
 //! A request stands here for as long as the thing that it asked for, ready or not. Tasks of the queue fulfil it: a
-//! check of its uploads, and, for a calibration, one that makes masks or a report. The thing's facts get a row in
-//! the table of its kind once they are known.
-
-use std::collections::HashMap;
+//! check of its uploads, and, for a calibration, one that makes masks or a report. The thing's facts are added once they
+//! are known; see `things.rs`.
 
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
@@ -12,10 +10,12 @@ use sqlx::sqlite::SqliteRow;
 use crate::Store;
 use crate::columns::{Columns, FromRow, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
-use crate::rows::{Filter, Page, Reference, listed_text, require};
+use crate::rows::{Reference, require};
 use crate::tables::keys::Made;
 use engine::intake::Refusal;
-use engine::job::{CheckLimits, Lab, Label, Submission, TaskState, ThingId, Timestamp, TokenId};
+use engine::job::{
+    CheckLimits, Lab, Label, Sha256, Submission, TaskState, ThingId, Timestamp, TokenId,
+};
 
 /// A request with its progress.
 #[derive(Debug, Clone)]
@@ -33,14 +33,6 @@ pub struct Request {
     pub created_at: Timestamp,
     /// Share of the work of its latest task that is done, on \[0,1\].
     pub fraction: f64,
-}
-
-/// A thing that a lab asked for.
-#[derive(Debug, Clone)]
-pub enum Asked<T> {
-    Ready(T),
-    /// It is being checked or made, or was refused.
-    Pending(Box<Request>),
 }
 
 impl Made {
@@ -89,6 +81,8 @@ macro_rules! requests {
     };
 }
 
+pub(super) use requests;
+
 impl Store {
     /// The lab's request for this thing; none if there is none.
     pub async fn find_request(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<Option<Request>> {
@@ -107,49 +101,9 @@ impl Store {
     /// True if a request is fulfilled, refused or deleted.
     pub async fn is_settled(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<bool> {
         let pending = "SELECT 1 FROM requests
-                       WHERE id = ?1 AND lab = ?2 AND refusal IS NULL
-                         AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = ?1)
-                         AND NOT EXISTS (SELECT 1 FROM measurements WHERE id = ?1)
-                         AND NOT EXISTS (SELECT 1 FROM models WHERE id = ?1)";
+                       WHERE id = ?1 AND lab = ?2 AND refusal IS NULL AND facts IS NULL";
         let pending = sql!(pending, [id.into(), lab]);
         Ok(pending.fetch_optional(&self.readers).await?.is_none())
-    }
-
-    /// A page of the lab's requests of one kind, newest first. `facts` selects the rows of ready things by their
-    /// identifiers, a JSON array.
-    pub(super) async fn asked<T>(
-        &self,
-        (lab, what): (&Lab, Made),
-        filter: Filter<ThingId>,
-        limit: u32,
-        facts: &'static str,
-        read: impl Fn(&SqliteRow) -> Result<(ThingId, T)>,
-    ) -> Result<Page<Asked<T>>> {
-        // Both statements see the same state of the database.
-        let mut snapshot = self.readers.begin().await?;
-        let items: Vec<Request> = sql_as!(
-            listed_text!(concat!(requests!(), " WHERE what = ?7 AND")),
-            [
-                lab,
-                filter.after,
-                filter.calibration,
-                i64::from(limit) + 1,
-                filter.created.from,
-                filter.created.before,
-                what.into_str()
-            ]
-        )
-        .fetch_all(&mut *snapshot)
-        .await?;
-        let page = Page::cut(items, limit);
-        let ids = serde_json::Value::from_iter(page.items.iter().map(|item| item.id.to_string()));
-        let rows = sql!(facts, [ids.to_string()]).fetch_all(&mut *snapshot).await?;
-        let mut ready: HashMap<ThingId, T> = rows.iter().map(read).collect::<Result<_>>()?;
-        let asked = |request: Request| match ready.remove(&request.id) {
-            Some(facts) => Asked::Ready(facts),
-            None => Asked::Pending(Box::new(request)),
-        };
-        Ok(Page { items: page.items.into_iter().map(asked).collect(), more: page.more })
     }
 
     /// Removes a request that its check refused. False if there is no such request, as of captures that passed the
@@ -229,10 +183,15 @@ pub async fn promise(connection: &mut SqliteConnection, id: ThingId, bytes: u64)
     Ok(())
 }
 
-/// Ends what a request held for being fulfilled: its uploads and its promise.
-pub async fn fulfil(connection: &mut SqliteConnection, id: ThingId) -> Result<()> {
+/// Ends what a request held for being fulfilled: its promise, and its uploads except `kept`.
+pub async fn fulfil(
+    connection: &mut SqliteConnection,
+    id: ThingId,
+    kept: Option<Sha256>,
+) -> Result<()> {
     promise(connection, id, 0).await?;
-    sql!("DELETE FROM request_files WHERE id = ?", [id]).execute(connection).await?;
+    let unused = "DELETE FROM request_files WHERE id = ? AND sha256 IS NOT ?";
+    sql!(unused, [id, kept]).execute(connection).await?;
     Ok(())
 }
 
@@ -243,54 +202,11 @@ pub async fn refuse(
     id: ThingId,
     refusal: &Refusal,
 ) -> Result<()> {
-    let refused = sql!(
-        "UPDATE requests SET refusal = ?1
-         WHERE id = ?2 AND NOT EXISTS (SELECT 1 FROM calibrations WHERE id = ?2)",
-        [Json(refusal), id]
-    );
+    let refused =
+        sql!("UPDATE requests SET refusal = ? WHERE id = ? AND facts IS NULL", [Json(refusal), id]);
     if refused.execute(&mut *connection).await?.rows_affected() > 0 {
         sql!("DELETE FROM request_keys WHERE id = ?", [id]).execute(&mut *connection).await?;
-        fulfil(connection, id).await?;
+        fulfil(connection, id, None).await?;
     }
     Ok(())
 }
-
-/// Gives a thing another name, or none.
-pub async fn rename(
-    connection: &mut SqliteConnection,
-    (lab, what, id): (&Lab, Made, ThingId),
-    name: Option<&Label>,
-) -> Result<()> {
-    let renamed = "UPDATE requests SET name = ? WHERE id = ? AND lab = ? AND what = ?";
-    let renamed = sql!(renamed, [name, id, lab, what.into_str()]).execute(connection).await?;
-    found(renamed.rows_affected(), what, id)
-}
-
-/// Removes a request of a lab. Its tasks are deleted with it: a worker that has one learns this from its next
-/// heartbeat.
-pub async fn delete(
-    connection: &mut SqliteConnection,
-    (lab, what, id): (&Lab, Made, ThingId),
-) -> Result<()> {
-    let deleted = "DELETE FROM requests WHERE id = ? AND lab = ? AND what = ?";
-    let deleted = sql!(deleted, [id, lab, what.into_str()]).execute(connection).await?;
-    found(deleted.rows_affected(), what, id)
-}
-
-fn found(rows: u64, what: Made, id: ThingId) -> Result<()> {
-    if rows > 0 { Ok(()) } else { Err(StoreError::missing(what.into_str(), id)) }
-}
-
-/// Number of measurements or models of a calibration, ready or being made.
-pub const USERS: [(&str, &str); 2] = [
-    (
-        "measurements",
-        "SELECT count(*) FROM requests
-         WHERE calibration = ? AND what = 'measurement' AND refusal IS NULL",
-    ),
-    (
-        "models",
-        "SELECT count(*) FROM requests
-         WHERE calibration = ? AND what = 'model' AND refusal IS NULL",
-    ),
-];

@@ -5,39 +5,57 @@ use crate::Store;
 use crate::columns::{sql, sql_as};
 use crate::error::Result;
 
+macro_rules! jobs {
+    () => {
+        "SELECT lab, state, count(*), sum(disk_bytes), sum(result_bytes) FROM jobs GROUP BY lab, state"
+    };
+}
+
+macro_rules! tasks {
+    () => {
+        "SELECT kind, state, count(*) FROM tasks GROUP BY kind, state"
+    };
+}
+
+macro_rules! files {
+    () => {
+        "SELECT lab, kind, count(*), sum(size)
+         FROM (SELECT lab, 'upload' AS kind, sha256 FROM holdings
+               UNION ALL
+               SELECT lab, 'movie', result FROM tasks WHERE thing IS NOT NULL AND result IS NOT NULL
+               UNION ALL
+               SELECT DISTINCT lab, 'prepared', prepared FROM requests
+               WHERE prepared IS NOT NULL AND what <> 'model')
+         JOIN blobs USING (sha256) GROUP BY lab, kind"
+    };
+}
+
+/// The number of rows in which new sums and the kept ones differ.
+macro_rules! difference {
+    ($sums:expr, $kept:expr) => {
+        concat!(
+            "WITH summed AS (",
+            $sums,
+            "), kept AS (SELECT * FROM ",
+            $kept,
+            ")
+             SELECT (SELECT count(*) FROM (SELECT * FROM summed EXCEPT SELECT * FROM kept))
+                  + (SELECT count(*) FROM (SELECT * FROM kept EXCEPT SELECT * FROM summed))"
+        )
+    };
+}
+
 /// Names of the tables with running totals, each with a statement that counts the totals that differ from a new sum.
 const DIFFERENCES: [(&str, &str); 4] = [
     (
         "jobs_by_state",
-        "WITH summed AS (
-             SELECT lab, state, count(*), sum(disk_bytes), sum(result_bytes) FROM jobs GROUP BY lab, state),
-         kept AS (
-             SELECT * FROM jobs_by_state WHERE jobs <> 0 OR disk_bytes <> 0 OR result_bytes <> 0)
-         SELECT (SELECT count(*) FROM (SELECT * FROM summed EXCEPT SELECT * FROM kept))
-              + (SELECT count(*) FROM (SELECT * FROM kept EXCEPT SELECT * FROM summed))",
+        difference!(
+            jobs!(),
+            "jobs_by_state WHERE jobs <> 0 OR disk_bytes <> 0 OR result_bytes <> 0"
+        ),
     ),
-    (
-        "tasks_by_state",
-        "WITH summed AS (SELECT kind, state, count(*) FROM tasks GROUP BY kind, state),
-         kept AS (SELECT * FROM tasks_by_state WHERE tasks <> 0)
-         SELECT (SELECT count(*) FROM (SELECT * FROM summed EXCEPT SELECT * FROM kept))
-              + (SELECT count(*) FROM (SELECT * FROM kept EXCEPT SELECT * FROM summed))",
-    ),
-    (
-        "files_of_labs",
-        "WITH files AS (
-             SELECT lab, 'upload' AS kind, sha256 FROM holdings
-             UNION ALL
-             SELECT lab, 'movie', result FROM tasks WHERE thing IS NOT NULL AND result IS NOT NULL
-             UNION ALL
-             SELECT lab, 'prepared', prepared
-             FROM (SELECT lab, prepared FROM calibrations UNION SELECT lab, prepared FROM measurements)),
-         summed AS (
-             SELECT lab, kind, count(*), sum(size) FROM files JOIN blobs USING (sha256) GROUP BY lab, kind),
-         kept AS (SELECT * FROM files_of_labs WHERE files <> 0 OR bytes <> 0)
-         SELECT (SELECT count(*) FROM (SELECT * FROM summed EXCEPT SELECT * FROM kept))
-              + (SELECT count(*) FROM (SELECT * FROM kept EXCEPT SELECT * FROM summed))",
-    ),
+    ("tasks_by_state", difference!(tasks!(), "tasks_by_state WHERE tasks <> 0")),
+    ("files_of_labs", difference!(files!(), "files_of_labs WHERE files <> 0 OR bytes <> 0")),
     (
         "stored_files",
         "SELECT (SELECT count(*) FROM blobs) <> (SELECT coalesce(sum(files), 0) FROM stored_files)
@@ -49,20 +67,11 @@ const DIFFERENCES: [(&str, &str); 4] = [
 /// Statements that replace all running totals by new sums.
 const RECOUNTS: [&str; 8] = [
     "DELETE FROM jobs_by_state",
-    "INSERT INTO jobs_by_state
-     SELECT lab, state, count(*), sum(disk_bytes), sum(result_bytes) FROM jobs GROUP BY lab, state",
+    concat!("INSERT INTO jobs_by_state ", jobs!()),
     "DELETE FROM tasks_by_state",
-    "INSERT INTO tasks_by_state SELECT kind, state, count(*) FROM tasks GROUP BY kind, state",
+    concat!("INSERT INTO tasks_by_state ", tasks!()),
     "DELETE FROM files_of_labs",
-    "INSERT INTO files_of_labs
-     SELECT lab, kind, count(*), sum(size)
-     FROM (SELECT lab, 'upload' AS kind, sha256 FROM holdings
-           UNION ALL
-           SELECT lab, 'movie', result FROM tasks WHERE thing IS NOT NULL AND result IS NOT NULL
-           UNION ALL
-           SELECT lab, 'prepared', prepared
-           FROM (SELECT lab, prepared FROM calibrations UNION SELECT lab, prepared FROM measurements))
-     JOIN blobs USING (sha256) GROUP BY lab, kind",
+    concat!("INSERT INTO files_of_labs ", files!()),
     "DELETE FROM stored_files",
     "INSERT INTO stored_files SELECT 1, count(*), coalesce(sum(size), 0) FROM blobs",
 ];

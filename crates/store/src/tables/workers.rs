@@ -25,13 +25,19 @@ pub struct WorkerRow {
     pub task: Option<WorkerTask>,
 }
 
-/// The tasks that a worker takes.
+/// The claimant of a task, which decides what it may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WorkerTakes {
-    /// Tiles, and on this machine all other tasks, too.
-    All,
+pub enum Claimant<'a> {
+    /// A worker of this machine that does all there is.
+    Local,
+    /// One that leaves the tiles to other machines.
     WithoutTiles,
-    ShortTasks,
+    /// One that takes short tasks alone, so that they wait for no tile. It begins no job: a job would be shown as
+    /// running though nobody computes it.
+    Light,
+    /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
+    /// run out.
+    Pool(&'a str),
 }
 
 /// The machine and device of a worker. Host and pool are empty for a worker of this machine.
@@ -60,13 +66,13 @@ pub struct WorkerTask {
 from_row!(WorkerTask, row => { job, calibration, kind, snapshot, tile, stage });
 
 impl Store {
-    /// Records that a worker has started; it has the version of this program.
+    /// Records that a worker has started, which takes the tasks that `claimant` may have. It has the version of this program.
     pub async fn worker_started(
         &self,
         id: WorkerId,
         pid: u32,
         WorkerPlace { host, pool, device }: &WorkerPlace,
-        takes: WorkerTakes,
+        claimant: Claimant<'_>,
     ) -> Result<()> {
         let now = Timestamp::now();
         sql!(
@@ -82,8 +88,8 @@ impl Store {
                 device,
                 now,
                 now,
-                takes == WorkerTakes::ShortTasks,
-                takes == WorkerTakes::All
+                claimant == Claimant::Light,
+                matches!(claimant, Claimant::Local | Claimant::Pool(_))
             ]
         )
         .execute(self.writer()?)

@@ -57,7 +57,7 @@ impl Lab {
     }
 
     async fn unready(&self, id: CalibrationId) -> Option<Request> {
-        match self.store.asked_calibration(&engine::job::Lab::local(), id).await.unwrap() {
+        match self.store.asked(&engine::job::Lab::local(), id).await.unwrap() {
             Asked::Ready(_) => None,
             Asked::Pending(request) => Some(*request),
         }
@@ -72,7 +72,6 @@ impl Lab {
     async fn made(&self, task: &ClaimedTask) -> Heartbeat {
         let Product::File(masks) = self.blob("masks of captures") else { panic!() };
         let facts = NewCalibration {
-            name: None,
             masks: masks.sha256(),
             format: "captures".into(),
             sample: "uint16".into(),
@@ -118,7 +117,7 @@ async fn a_calibration_precedes_every_job_and_is_visible() {
     let shown = lab.unready(first).await.unwrap();
     assert_eq!((shown.fraction, shown.refusal), (0.5, None));
     let refused = lab.store.calibration(&local, first).await;
-    assert!(matches!(refused, Err(StoreError::Unready { error: None, .. })));
+    assert!(matches!(refused, Err(StoreError::NotReady { error: None, .. })));
     // Jobs are forecast and watched as if there were no calibrations.
     let waiting = lab.store.job(&local, job).await.unwrap();
     assert_eq!(lab.store.progress(&waiting).await.unwrap().queue_position, Some(1));
@@ -135,7 +134,7 @@ async fn a_calibration_precedes_every_job_and_is_visible() {
     assert_eq!(totals.iter().find(|total| done(&total.kind)).unwrap().tasks, 2);
     assert_eq!(lab.claim().await.unwrap().kind, TaskKind::Calibration);
     assert_eq!(lab.claim().await.unwrap().step().job, job);
-    lab.store.delete_calibration(&local, second).await.unwrap();
+    lab.store.delete(&local, second).await.unwrap();
 }
 
 #[tokio::test]
@@ -144,8 +143,8 @@ async fn a_worker_of_a_deleted_calibration_stops() {
     let local = engine::job::Lab::local();
     let id = lab.calibrate().await;
     let task = lab.claim().await.unwrap();
-    lab.store.delete_calibration(&local, id).await.unwrap();
-    let again = lab.store.delete_calibration(&local, id).await;
+    lab.store.delete(&local, id).await.unwrap();
+    let again = lab.store.delete(&local, id).await;
     assert!(matches!(again, Err(StoreError::NotFound { .. })));
     let beat = lab.store.heartbeat(&task.lease, TaskProgress::START, None).await.unwrap();
     assert_eq!(beat, Heartbeat::Lost);

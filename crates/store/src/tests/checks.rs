@@ -162,7 +162,7 @@ async fn a_check_of_a_deleted_request_stops() {
         lab.store.delete_upload(&local, masks).await,
         Err(StoreError::FileInUse(file)) if file == masks
     ));
-    lab.store.delete_calibration(&local, asked).await.unwrap();
+    lab.store.delete(&local, asked).await.unwrap();
     let beat = lab.store.heartbeat(&task.lease, TaskProgress::START, None).await.unwrap();
     assert_eq!(beat, Heartbeat::Lost);
     let late = lab.store.promise(&task.lease, 1000, (1, 0)).await;
@@ -226,7 +226,7 @@ async fn lists_hold_what_is_there_and_what_is_not_in_one_order() {
     let mut seen = Vec::new();
     let mut filter = crate::Filter::default();
     loop {
-        let page = lab.store.measurements(&local, filter, 2).await.unwrap();
+        let page = lab.store.things(&local, filter, 2).await.unwrap();
         seen.extend(page.items.iter().map(|item| match item {
             Asked::Ready(measurement) => (measurement.id, true),
             Asked::Pending(request) => (request.id.into(), false),
@@ -239,9 +239,9 @@ async fn lists_hold_what_is_there_and_what_is_not_in_one_order() {
     assert_eq!(seen, [(ids[2], false), (ids[1], false), (ids[0], true)]);
     // A pending measurement keeps its calibration and can't be used.
     let calibration = ready.facts.calibration;
-    let refused = lab.store.delete_calibration(&local, calibration).await;
+    let refused = lab.store.delete(&local, calibration).await;
     assert!(matches!(refused, Err(StoreError::InUse { by: "measurements", users: 3, .. })));
     let refused = lab.store.measurement(&local, ids[1]).await;
-    assert!(matches!(refused, Err(StoreError::Unchecked { error: None, .. })));
+    assert!(matches!(refused, Err(StoreError::NotReady { error: None, .. })));
     id(lab.add_algorithm(Algorithm::GapTv, 0, None, b"request").await.unwrap());
 }

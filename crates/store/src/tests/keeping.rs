@@ -6,7 +6,7 @@ use std::time::Duration;
 use futures_util::FutureExt;
 
 use super::Lab;
-use crate::{Checked, Inserted, JobFilter, StoreError};
+use crate::{Checked, Inserted, JobFilter, NewModel, StoreError};
 use engine::job::{JobId, ModelFacts, ModelId, ModelRequest, ModelTrial, Submission, Timestamp};
 
 #[tokio::test]
@@ -55,16 +55,14 @@ async fn used_things_are_kept_and_unused_ones_collected() {
     let calibration =
         lab.store.job(&engine::job::Lab::local(), job).await.unwrap().spec.calibration;
     let in_use = |result| matches!(result, Err(StoreError::InUse { users: 1, .. }));
-    assert!(in_use(lab.store.delete_calibration(&engine::job::Lab::local(), calibration).await));
-    assert!(in_use(
-        lab.store.delete_measurement(&engine::job::Lab::local(), lab.measurement).await
-    ));
+    assert!(in_use(lab.store.delete(&engine::job::Lab::local(), calibration).await));
+    assert!(in_use(lab.store.delete(&engine::job::Lab::local(), lab.measurement).await));
     let soon = Timestamp(Timestamp::now().0 + 1000);
     assert_eq!(lab.store.collect(soon).await.unwrap().len(), 0);
     lab.store.cancel_job(&engine::job::Lab::local(), job).await.unwrap();
     lab.store.delete_job(&engine::job::Lab::local(), job).await.unwrap();
-    lab.store.delete_measurement(&engine::job::Lab::local(), lab.measurement).await.unwrap();
-    lab.store.delete_calibration(&engine::job::Lab::local(), calibration).await.unwrap();
+    lab.store.delete(&engine::job::Lab::local(), lab.measurement).await.unwrap();
+    lab.store.delete(&engine::job::Lab::local(), calibration).await.unwrap();
     assert_eq!(lab.store.blob_totals().await.unwrap().0, 2, "uploads wait for their age");
     assert_eq!(lab.store.collect(soon).await.unwrap().len(), 2);
     let left = walk(&lab.store.dir().blobs());
@@ -88,17 +86,18 @@ async fn the_file_of_a_model_is_kept_and_its_calibration_too() {
     let trial = ModelTrial { height: 64, width: 96, cpu_seconds: 1.0, peak_rss_bytes: 1 << 20 };
     let facts = ModelFacts { inputs: Vec::new(), outputs: Vec::new(), fixed_size: true, trial };
     let asked = ModelRequest { name: None, calibration, file: file.sha256 };
+    let facts = NewModel { calibration, file: file.sha256, facts };
     let id: ModelId = lab.make(Submission::Model(asked), Checked::Model(facts)).await;
     let model = lab.store.model(&local, id).await.unwrap();
-    lab.store.delete_measurement(&local, lab.measurement).await.unwrap();
+    lab.store.delete(&local, lab.measurement).await.unwrap();
     let soon = Timestamp(Timestamp::now().0 + 1000);
     assert_eq!(lab.store.collect(soon).await.unwrap().len(), 1, "the data of the measurement");
     assert!(lab.store.upload(&local, file.sha256).await.is_ok());
-    let refused = lab.store.delete_calibration(&local, calibration).await;
+    let refused = lab.store.delete(&local, calibration).await;
     assert!(matches!(refused, Err(StoreError::InUse { by: "models", users: 1, .. })));
-    lab.store.delete_model(&local, model.id).await.unwrap();
+    lab.store.delete(&local, model.id).await.unwrap();
     assert_eq!(lab.store.collect(soon).await.unwrap().len(), 1, "the network");
-    lab.store.delete_calibration(&local, calibration).await.unwrap();
+    lab.store.delete(&local, calibration).await.unwrap();
 }
 
 /// True if the job exists with all its files, or neither it nor a file of it.

@@ -120,7 +120,7 @@ async fn totals_equal_new_sums_after_random_operations() {
                 drop(lab.store.remove_lab(&named(1 + random.below(2))).await);
                 for asked in lab
                     .store
-                    .measurements(&named(0), crate::Filter::default(), 100)
+                    .things(&named(0), crate::Filter::<engine::job::MeasurementId>::default(), 100)
                     .await
                     .unwrap()
                     .items
@@ -129,7 +129,7 @@ async fn totals_equal_new_sums_after_random_operations() {
                         && found.id != lab.measurement
                         && random.below(2) == 0
                     {
-                        drop(lab.store.delete_measurement(&named(0), found.id).await);
+                        drop(lab.store.delete(&named(0), found.id).await);
                     }
                 }
             }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::{Lab, id};
-use crate::{Entitlement, WorkerEnd, WorkerPlace, WorkerTakes};
+use crate::{Claimant, Entitlement, WorkerEnd, WorkerPlace};
 use engine::job::{Algorithm, JobId, TaskKind, WorkerId};
 
 fn named(name: &str) -> engine::job::Lab {
@@ -128,9 +128,9 @@ async fn jobs_have_an_eta_only_while_a_worker_takes_tiles() {
     assert_eq!(lab.store.live_tile_workers(age).await.unwrap(), 1);
     lab.store.worker_ended(lab.worker, &WorkerEnd::Left).await.unwrap();
     let last = lab.store.last_tile_worker().await.unwrap();
-    for takes in [WorkerTakes::WithoutTiles, WorkerTakes::ShortTasks] {
+    for claimant in [Claimant::WithoutTiles, Claimant::Light] {
         let place = WorkerPlace::default();
-        lab.store.worker_started(WorkerId::new(), 1, &place, takes).await.unwrap();
+        lab.store.worker_started(WorkerId::new(), 1, &place, claimant).await.unwrap();
     }
     assert_eq!((eta().await, lab.store.live_tile_workers(age).await.unwrap()), (None, 0));
     assert!(last.is_some(), "the sign of a worker that has ended");

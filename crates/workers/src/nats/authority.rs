@@ -66,9 +66,7 @@ pub struct Issued {
 
 impl Authority {
     /// Creates new keys in a folder.
-    ///
-    /// # Errors
-    /// If the folder already contains keys, or can't be written.
+    /// Errors: the folder already contains keys, or can't be written.
     pub fn create(folder: &Path, url: &str) -> Result<Self, ClusterError> {
         let path = folder.join(FILE);
         if path.exists() {
@@ -94,9 +92,7 @@ impl Authority {
 
     /// Writes the credential of the server and the credential for revocations. Create certificates before, if the
     /// connections are to be encrypted.
-    ///
-    /// # Errors
-    /// If they can't be written.
+    /// Errors: they can't be written.
     pub fn write_own_credentials(&self) -> Result<(), ClusterError> {
         let header = format!("url: {}\n{}", self.url, self.certificate()?);
         let unrestricted = json!({"pub": {}, "sub": {}});
@@ -119,9 +115,7 @@ impl Authority {
     }
 
     /// Reads the keys in a folder.
-    ///
-    /// # Errors
-    /// If the folder contains no keys, or they can't be read.
+    /// Errors: the folder contains no keys, or they can't be read.
     pub fn open(folder: &Path) -> Result<Self, ClusterError> {
         let path = folder.join(FILE);
         let text = fs::read_to_string(&path).map_err(at(&path))?;
@@ -137,9 +131,7 @@ impl Authority {
     }
 
     /// The operator's token, for the configuration of the message server.
-    ///
-    /// # Errors
-    /// If the keys are damaged.
+    /// Errors: the keys are damaged.
     pub fn operator_token(&self) -> Result<String, ClusterError> {
         let operator = pair(&self.operator)?;
         let nats = json!({
@@ -149,9 +141,7 @@ impl Authority {
     }
 
     /// Public keys and tokens of the system account and of the service's account.
-    ///
-    /// # Errors
-    /// If the keys are damaged.
+    /// Errors: the keys are damaged.
     pub fn accounts(&self) -> Result<[(String, String); 2], ClusterError> {
         let system = pair(&self.system)?.public_key();
         let operator = pair(&self.operator)?;
@@ -181,9 +171,7 @@ impl Authority {
 
     /// Issues a credential for the workers of a pool, which expires after `days` days. The file is readable by its
     /// owner only.
-    ///
-    /// # Errors
-    /// If a valid credential has the same name, or the file can't be written.
+    /// Errors: a valid credential has the same name, or the file can't be written.
     pub fn create_worker(
         &mut self,
         pool: &Pool,
@@ -222,9 +210,7 @@ impl Authority {
 
     /// Revokes the credentials of a pool, or the one called `name`. Returns the names of those that were revoked now.
     /// [`Authority::publish`] sends the revocations to the message server.
-    ///
-    /// # Errors
-    /// If no credential matches, or the folder can't be written.
+    /// Errors: no credential matches, or the folder can't be written.
     pub fn revoke(&mut self, pool: &Pool, name: Option<&str>) -> Result<Vec<String>, ClusterError> {
         let now = seconds();
         let matches =
@@ -247,9 +233,7 @@ impl Authority {
     }
 
     /// Sends the revocations to the message server, which disconnects the revoked users.
-    ///
-    /// # Errors
-    /// If it can't be reached, or does not accept the token.
+    /// Errors: it can't be reached, or does not accept the token.
     pub async fn publish(&self) -> Result<(), ClusterError> {
         let credential = Credential::read(&self.folder.join(SYSTEM))?;
         let connection = Access::new(None, &credential, "sci-recon cluster")?.connect().await?;

@@ -33,9 +33,7 @@ pub enum BlobError {
 
 impl Connection {
     /// Puts a file under `prefix`, a subject of a stream.
-    ///
-    /// # Errors
-    /// If the stream is full, or has no quorum.
+    /// Errors: the stream is full, or has no quorum.
     pub(super) async fn put(&self, prefix: &str, bytes: Bytes) -> Result<(), ClusterError> {
         let count = chunks(bytes.len());
         let rest = stream::iter((1..count).map(|n| self.put_chunk(prefix, &bytes, n)));
@@ -51,9 +49,7 @@ impl Connection {
     }
 
     /// Gets the file under `prefix` out of a stream.
-    ///
-    /// # Errors
-    /// See [`BlobError`].
+    /// Errors: see [`BlobError`].
     pub(super) async fn get(
         &self,
         stream: &str,
@@ -100,9 +96,7 @@ impl Connection {
     }
 
     /// Removes all messages of a stream whose subjects match.
-    ///
-    /// # Errors
-    /// If the server refuses, or has no quorum.
+    /// Errors: the server refuses, or has no quorum.
     pub(super) async fn purge(&self, stream: &str, subjects: String) -> Result<(), ClusterError> {
         let failed = ClusterError::nats("purge a stream");
         let stream = self.context.get_stream_no_info(stream).await;

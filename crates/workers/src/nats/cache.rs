@@ -33,9 +33,7 @@ struct CachedFile {
 
 impl Cache {
     /// Opens a folder, and creates it if it is missing. Files of other origin remain untouched.
-    ///
-    /// # Errors
-    /// If it can't be created or read, or if another worker uses it: each would remove files that the other needs.
+    /// Errors: it can't be created or read, or another worker uses it: each would remove files that the other needs.
     pub fn open(folder: &Path, limit: u64) -> Result<Self, ClusterError> {
         let failed = |error: io::Error| ClusterError::Cache {
             path: folder.display().to_string(),
@@ -98,9 +96,7 @@ impl Cache {
     }
 
     /// Adds a file. Files in `needed` are not removed to make room.
-    ///
-    /// # Errors
-    /// If it is too large for the cache, or the disk fails.
+    /// Errors: it is too large for the cache, or the disk fails.
     pub fn add(&mut self, sha256: Sha256, bytes: &[u8], needed: &[Sha256]) -> io::Result<()> {
         let size = bytes.len() as u64;
         self.make_room(size, needed)?;

@@ -49,9 +49,7 @@ impl Check {
     }
 
     /// Checks what a server needs. With the credential of a pool, it checks what a worker of the pool needs.
-    ///
-    /// # Errors
-    /// If no message server can be reached.
+    /// Errors: no message server can be reached.
     pub async fn run(
         urls: Option<&str>,
         credential: Option<&Path>,

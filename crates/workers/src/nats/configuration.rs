@@ -92,9 +92,7 @@ pub fn url(nodes: &[Node], tls: bool) -> String {
 }
 
 /// Writes the certificates, which [`Authority::create_worker`] then adds to credentials.
-///
-/// # Errors
-/// If they can't be generated or written.
+/// Errors: they can't be generated or written.
 pub fn make_certificates(folder: &Path, nodes: &[Node]) -> Result<(), ClusterError> {
     let failed = at(folder);
     let mut authority = CertificateParams::default();
@@ -118,9 +116,7 @@ pub fn make_certificates(folder: &Path, nodes: &[Node]) -> Result<(), ClusterErr
 /// Writes the configuration of each node into the folder of the keys. `store` is the folder for messages on the
 /// node's machine, and `bytes` limits its size. `version` is the nodes' version of nats-server. The default is the
 /// version on this machine, or a current one if there is none.
-///
-/// # Errors
-/// If they can't be written, or a nats-server on this machine rejects them.
+/// Errors: they can't be written, or a nats-server on this machine rejects them.
 pub fn write(
     authority: &Authority,
     folder: &Path,

@@ -74,9 +74,7 @@ pub struct Credential {
 
 impl Credential {
     /// Reads a file.
-    ///
-    /// # Errors
-    /// [`ClusterError::Credential`] if it can't be read.
+    /// Errors: [`ClusterError::Credential`] if it can't be read.
     pub fn read(path: &Path) -> Result<Self, ClusterError> {
         let wrong = |reason: String| {
             let path = path.display().to_string();
@@ -89,7 +87,7 @@ impl Credential {
             values.next().map(|value| value.trim().to_owned())
         };
         let pool = field("pool").map(|name| name.parse()).transpose();
-        let pool = pool.map_err(|error: engine::job::InvalidPool| wrong(error.to_string()))?;
+        let pool = pool.map_err(|error: engine::job::InvalidText| wrong(error.to_string()))?;
         let authority = text.find("-----BEGIN CERTIFICATE-----").and_then(|start| {
             let mark = "-----END CERTIFICATE-----\n";
             let end = text.rfind(mark)? + mark.len();
@@ -119,9 +117,7 @@ pub struct Access {
 
 impl Access {
     /// Access to the servers in `urls`, separated by commas, or to those that the credential names. Does not connect.
-    ///
-    /// # Errors
-    /// If an address or the credential is invalid, or no address is known.
+    /// Errors: an address or the credential is invalid, or no address is known.
     pub fn new(
         urls: Option<&str>,
         credential: &Credential,
@@ -180,9 +176,7 @@ impl Access {
     }
 
     /// Connects to one of the servers.
-    ///
-    /// # Errors
-    /// If no server answers, or none accepts the credential.
+    /// Errors: no server answers, or none accepts the credential.
     pub async fn connect(&self) -> Result<Connection, ClusterError> {
         let connected = self.options.clone().connect(self.servers.as_slice()).await;
         let url = self.urls.clone();

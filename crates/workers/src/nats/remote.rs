@@ -143,9 +143,7 @@ enum Ownership {
 impl Remote {
     /// Connects and introduces the worker. Waits for a server that has not started yet. Returns `None` if `stop` was
     /// cancelled, or the idle time is over, before the server answered.
-    ///
-    /// # Errors
-    /// If the settings are invalid, the message server does not answer, or the server refuses the worker.
+    /// Errors: the settings are invalid, the message server does not answer, or the server refuses the worker.
     pub async fn open(
         settings: RemoteSettings,
         worker: WorkerId,

@@ -54,9 +54,7 @@ fn streams() -> [Config; 4] {
 
 impl Connection {
     /// Creates missing streams. Returns the creation time of the stream of tiles, which identifies it.
-    ///
-    /// # Errors
-    /// If the server refuses, or has no quorum.
+    /// Errors: the server refuses, or has no quorum.
     pub(super) async fn make_streams(&self) -> Result<String, ClusterError> {
         for config in streams() {
             if self.context.get_stream(&config.name).await.is_err() {
@@ -86,9 +84,7 @@ impl Connection {
     }
 
     /// Creates the consumer from which all workers of a pool pull.
-    ///
-    /// # Errors
-    /// If the server refuses, or has no quorum.
+    /// Errors: the server refuses, or has no quorum.
     pub(super) async fn make_pool(
         &self,
         pool: &Pool,
@@ -108,9 +104,7 @@ impl Connection {
     }
 
     /// Finds the consumer of a pool.
-    ///
-    /// # Errors
-    /// If it does not exist, or the credential has no right to it.
+    /// Errors: it does not exist, or the credential has no right to it.
     pub(super) async fn pool(&self, pool: &Pool) -> Result<PullConsumer, ClusterError> {
         let consumer = self.context.get_consumer_from_stream(pool.as_str(), names::TASKS).await;
         consumer.map_err(ClusterError::nats("find the consumer of the pool"))
@@ -124,9 +118,7 @@ impl Connection {
     }
 
     /// Lists the pools with waiting events.
-    ///
-    /// # Errors
-    /// If the server refuses, or has no quorum.
+    /// Errors: the server refuses, or has no quorum.
     pub(super) async fn pools_with_events(&self) -> Result<Vec<Pool>, ClusterError> {
         let failed = || ClusterError::nats("read the subjects of events");
         let stream = self.context.get_stream_no_info(names::EVENTS).await;
@@ -137,9 +129,7 @@ impl Connection {
     }
 
     /// The consumer of a pool's events. Creates it if it is missing.
-    ///
-    /// # Errors
-    /// If the server refuses, or has no quorum.
+    /// Errors: the server refuses, or has no quorum.
     pub(super) async fn events(&self, pool: &Pool) -> Result<PullConsumer, ClusterError> {
         let config = Consumer {
             durable_name: Some(names::events(pool)),

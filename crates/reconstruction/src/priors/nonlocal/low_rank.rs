@@ -38,55 +38,37 @@ impl Default for Filter {
 // The filter of a group is `Y <- mean + G^2 (G^2 + tau^2)^-1 (Y - mean)` with `G` of the centred patches, which
 // equals `Y - tau^2 (G^2 + tau^2)^-1 (Y - mean)`.
 
+/// Performs a step on each part of a batch, in tiles as wide as the registers of the machine allow.
+macro_rules! for_each_part {
+    ($simd:ident, $filter:ident, $part:ident => $step:expr) => {
+        if S::F32_LANES == 16 {
+            for mut $part in parts::<S, 4>($simd, $filter) {
+                $step
+            }
+        } else {
+            for mut $part in parts::<S, 2>($simd, $filter) {
+                $step
+            }
+        }
+    };
+}
+
 /// `G = (Y - mean) (Y - mean)^T`.
 #[inline(always)]
 pub(super) fn multiply<S: Simd>(simd: S, filter: &mut Filter) {
-    match S::F32_LANES {
-        16 => {
-            for mut part in parts::<S, 4>(simd, filter) {
-                part.multiply();
-            }
-        }
-        _ => {
-            for mut part in parts::<S, 2>(simd, filter) {
-                part.multiply();
-            }
-        }
-    }
+    for_each_part!(simd, filter, part => part.multiply());
 }
 
 /// The Cholesky factor of `G^2 + tau^2`.
 #[inline(always)]
 pub(super) fn factorize<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
-    match S::F32_LANES {
-        16 => {
-            for mut part in parts::<S, 4>(simd, filter) {
-                part.factorize(tau);
-            }
-        }
-        _ => {
-            for mut part in parts::<S, 2>(simd, filter) {
-                part.factorize(tau);
-            }
-        }
-    }
+    for_each_part!(simd, filter, part => part.factorize(tau));
 }
 
 /// Computes the filtered patches in place of `Y`.
 #[inline(always)]
 pub(super) fn solve<S: Simd>(simd: S, filter: &mut Filter, tau: f32) {
-    match S::F32_LANES {
-        16 => {
-            for mut part in parts::<S, 4>(simd, filter) {
-                part.solve(tau);
-            }
-        }
-        _ => {
-            for mut part in parts::<S, 2>(simd, filter) {
-                part.solve(tau);
-            }
-        }
-    }
+    for_each_part!(simd, filter, part => part.solve(tau));
 }
 
 #[inline(always)]

@@ -7,7 +7,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::core::Core;
-use super::error::EventError;
+use super::error::HubError;
 use super::replays::{First, Verdict};
 use crate::local::tile_task;
 use crate::nats::blobs::BlobError;
@@ -76,7 +76,7 @@ impl Core {
         remote: &RemoteTask,
         prefix: &str,
         report: Report,
-    ) -> Result<Accepted, EventError> {
+    ) -> Result<Accepted, HubError> {
         let known = self.known(remote).await?;
         let Report { frames, progress, record, history } = report;
         let record = match known.check(remote, frames, (&progress, record, history.as_deref())) {
@@ -106,7 +106,7 @@ impl Core {
     }
 
     /// Looks up the task, the arrays and the shape of a tile that is out.
-    async fn known(&self, remote: &RemoteTask) -> Result<Known, EventError> {
+    async fn known(&self, remote: &RemoteTask) -> Result<Known, HubError> {
         let claimed = self.store.remote_work(remote).await?;
         let wrong = || PipelineError::Record { what: "task", problem: "it is not a tile".into() };
         let (Work::Job(job), TaskKind::Tile { snapshot, tile, .. }) = (&claimed.work, claimed.kind)
@@ -137,7 +137,7 @@ impl Core {
         known: Known,
         staged: &StagedBlob,
         mut record: TileTaskRecord,
-    ) -> Result<Result<TileTaskRecord, String>, EventError> {
+    ) -> Result<Result<TileTaskRecord, String>, HubError> {
         let path = staged.path().to_owned();
         // Bounds the memory: each check holds the masks of its tile.
         let Ok(_turn) = self.verifying.acquire().await else {
@@ -229,6 +229,7 @@ impl Known {
             ("assessment", assessment.iter().all(|values| values.fits(frames, (height, width)))),
             ("provider", is_name(&cost.provider)),
             ("onnxruntime", is_name(&cost.onnxruntime)),
+            ("gpu", is_name(&cost.gpu)),
             ("cpu_seconds", (0.0..=seconds).contains(&cost.cpu_seconds)),
             ("peak_rss_bytes", cost.peak_rss_bytes <= MAX_MEMORY),
         ];

@@ -1,7 +1,7 @@
 //! Has another worker compute a tile again, and compares the two results.
 
 use super::core::{Core, lock};
-use super::error::EventError;
+use super::error::HubError;
 use super::figures;
 use super::replays::{First, Verdict};
 use engine::job::{Pool, TaskId, WorkerId};
@@ -15,7 +15,7 @@ impl Core {
         remote: &RemoteTask,
         result: First,
         white: f32,
-    ) -> Result<Verdict, EventError> {
+    ) -> Result<Verdict, HubError> {
         let task = remote.task;
         let first = lock(&self.replays).take(task);
         let Some(first) = first else {
@@ -38,7 +38,7 @@ impl Core {
             Ok::<_, PipelineError>((first, result.worker(), difference))
         });
         let (first, second, difference) = compared.await??;
-        figures::replayed(1);
+        figures::count(figures::REPLAYED, 1);
         match difference {
             None => {
                 lock(&self.replays).judge(task, true);
@@ -49,7 +49,7 @@ impl Core {
                     %task, first = %first.worker(), %second, difference,
                     "two workers disagree on a tile: one of them computes wrong results"
                 );
-                figures::mismatched(1);
+                figures::count(figures::MISMATCHED, 1);
                 lock(&self.replays).judge(task, false);
                 Ok(Verdict::Differs(format!("worker {} disagrees: {difference}", first.worker())))
             }
@@ -63,7 +63,7 @@ impl Core {
         pool: &Pool,
         task: TaskId,
         worker: WorkerId,
-    ) -> Result<bool, EventError> {
+    ) -> Result<bool, HubError> {
         if lock(&self.replays).first_worker(task) != Some(worker) {
             return Ok(false);
         }

@@ -8,6 +8,7 @@ use bytes::Bytes;
 use tokio::sync::Semaphore;
 
 use super::core::{Core, lock};
+use super::error::HubError;
 use super::figures;
 use crate::local::tile_task;
 use crate::nats::connection::ClusterError;
@@ -27,24 +28,6 @@ const TICK: Duration = Duration::from_millis(200);
 const AT_ONCE: usize = 4;
 /// Pause after a failure of the store or the message server.
 const RETRY_PAUSE: Duration = Duration::from_secs(2);
-
-/// Failure to send a tile.
-#[derive(Debug, thiserror::Error)]
-enum SendError {
-    /// The tile's input is the cause.
-    #[error(transparent)]
-    Tile(#[from] PipelineError),
-    #[error(transparent)]
-    Cluster(#[from] ClusterError),
-    #[error(transparent)]
-    Store(#[from] StoreError),
-}
-
-impl From<FormatError> for SendError {
-    fn from(error: FormatError) -> Self {
-        Self::Tile(error.into())
-    }
-}
 
 impl Core {
     /// Hands tiles out until the future is dropped.
@@ -109,7 +92,7 @@ impl Core {
         }
         while let Err(error) = self.try_send(pool, &claimed).await {
             tracing::warn!(%error, task = %lease.task, "a tile can't be sent");
-            if let SendError::Tile(error) = &error {
+            if let HubError::Tile(error) = &error {
                 let reason = without_paths(&error.to_string());
                 match self.store.fail(&lease, &reason, error.is_retryable()).await {
                     Ok(()) => break,
@@ -125,7 +108,7 @@ impl Core {
         lock(&self.sending).remove(&lease.task);
     }
 
-    async fn try_send(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<(), SendError> {
+    async fn try_send(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<(), HubError> {
         let (lease, message) = (claimed.lease, self.prepare(pool, claimed).await?);
         let text = serde_json::to_vec(&message).map_err(PipelineError::record("tile"))?;
         let id = format!("{}.{}", lease.task, lease.attempt);
@@ -149,7 +132,7 @@ impl Core {
     }
 
     /// Sends the inputs of a tile that are missing in the stream, and returns the tile's message.
-    async fn prepare(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<TaskMessage, SendError> {
+    async fn prepare(&self, pool: &Pool, claimed: &ClaimedTask) -> Result<TaskMessage, HubError> {
         let wrong = || PipelineError::Record { what: "task", problem: "it is not a tile".into() };
         let Work::Job(job) = &claimed.work else { return Err(wrong().into()) };
         let TaskKind::Tile { snapshot, tile, .. } = claimed.kind else {
@@ -192,7 +175,7 @@ impl Core {
         Ok(cut.await.map_err(|_| PipelineError::Thread)??)
     }
 
-    async fn put_model(&self, pool: &Pool, sha256: Sha256) -> Result<Input, SendError> {
+    async fn put_model(&self, pool: &Pool, sha256: Sha256) -> Result<Input, HubError> {
         let path = self.store.dir().blob(&sha256);
         let read = tokio::fs::read(path).await;
         let failed = |source| FormatError::Io { action: "read the network's file", source };
@@ -200,7 +183,7 @@ impl Core {
     }
 
     /// Puts a file into the stream of inputs, unless it was sent recently.
-    async fn put_input(&self, pool: &Pool, bytes: Vec<u8>) -> Result<Input, SendError> {
+    async fn put_input(&self, pool: &Pool, bytes: Vec<u8>) -> Result<Input, HubError> {
         let hashed = tokio::task::spawn_blocking(move || (Sha256::of(&bytes), bytes)).await;
         let (sha256, bytes) = hashed.map_err(|_| PipelineError::Thread)?;
         let size = bytes.len();

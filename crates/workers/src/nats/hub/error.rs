@@ -1,12 +1,13 @@
-//! Errors that postpone a worker's message.
+//! Errors of the hub.
 
 use crate::nats::connection::ClusterError;
 use engine::pipeline::PipelineError;
+use formats::FormatError;
 use store::StoreError;
 
-/// Reason for which an event is postponed.
+/// Reason for which an event or a tile is postponed, or a sweep ends early.
 #[derive(Debug, thiserror::Error)]
-pub enum EventError {
+pub enum HubError {
     #[error(transparent)]
     Cluster(#[from] ClusterError),
     #[error(transparent)]
@@ -21,7 +22,13 @@ pub enum EventError {
     Tile(#[from] PipelineError),
 }
 
-impl EventError {
+impl From<FormatError> for HubError {
+    fn from(error: FormatError) -> Self {
+        Self::Tile(error.into())
+    }
+}
+
+impl HubError {
     /// True if the event may be the cause. False if a disk or a message server has failed.
     pub fn is_of_event(&self) -> bool {
         match self {

@@ -18,7 +18,7 @@ use tokio::task::JoinHandle;
 
 use super::accept::{Accepted, Report};
 use super::core::{Core, lock};
-use super::error::EventError;
+use super::error::HubError;
 use super::figures;
 use crate::nats::blobs::BlobError;
 use crate::nats::connection::ClusterError;
@@ -161,12 +161,12 @@ impl Core {
         pool: &Pool,
         message: &Message,
         event: Result<Event, serde_json::Error>,
-    ) -> Result<(), EventError> {
+    ) -> Result<(), HubError> {
         let event = match event {
             Ok(event) => event,
             Err(error) => {
                 tracing::error!(%error, %pool, "an event can't be read; it is dropped");
-                figures::refused(1);
+                figures::count(figures::REFUSED, 1);
                 return Ok(());
             }
         };
@@ -185,12 +185,12 @@ impl Core {
         }
     }
 
-    async fn handle(&self, pool: &Pool, event: Event) -> Result<(), EventError> {
+    async fn handle(&self, pool: &Pool, event: Event) -> Result<(), HubError> {
         let Event { task, attempt, worker, .. } = event;
         let prefix = names::output(pool, task, attempt, worker);
         let Some(remote) = self.task_of(pool, &event).await? else {
             tracing::info!(%task, attempt, %worker, "a report is refused: the attempt is not the worker's");
-            figures::refused(1);
+            figures::count(figures::REFUSED, 1);
             self.connection.purge(names::OUTPUTS, format!("{prefix}.>")).await?;
             return Ok(());
         };
@@ -205,7 +205,7 @@ impl Core {
                         let last = RemoteBeat { task, attempt, worker, pool, progress, history };
                         self.store.remote_beats(&[last], &[]).await?;
                         match self.store.complete(&lease, *completion).await? {
-                            Heartbeat::Lost => figures::refused(1),
+                            Heartbeat::Lost => figures::count(figures::REFUSED, 1),
                             _ => tracing::info!(%task, attempt, %worker, "a tile is done"),
                         }
                     }
@@ -214,13 +214,13 @@ impl Core {
                     }
                     Accepted::Refused(reason) => {
                         tracing::error!(%task, attempt, %worker, reason, "a worker's result is rejected");
-                        figures::rejected(1);
+                        figures::count(figures::REJECTED, 1);
                         let reason = format!("the result of worker {worker} is rejected: {reason}");
                         self.store.fail(&lease, &reason, true).await?;
                     }
                     Accepted::Lost(error) => {
                         tracing::warn!(%error, %task, attempt, %worker, "a tile's frames are lost");
-                        figures::repaired(1);
+                        figures::count(figures::REPAIRED, 1);
                         self.store.remote_lost(&remote, "its frames were lost in transit").await?;
                     }
                 }
@@ -243,7 +243,7 @@ impl Core {
 
     /// Finds the tile of an event. Returns `None` if the worker does not own the attempt. If the worker began while the
     /// server was down, its begin is recorded now.
-    async fn task_of(&self, pool: &Pool, event: &Event) -> Result<Option<RemoteTask>, EventError> {
+    async fn task_of(&self, pool: &Pool, event: &Event) -> Result<Option<RemoteTask>, HubError> {
         let &Event { task, attempt, worker, seq, delivery, .. } = event;
         let remote = self.store.remote_task(task).await?;
         let Some(remote) = remote.filter(|remote| remote.pool == pool.as_str()) else {
@@ -264,7 +264,7 @@ impl Core {
         &self,
         prefix: &str,
         frames: Input,
-    ) -> Result<Result<StagedBlob, BlobError>, EventError> {
+    ) -> Result<Result<StagedBlob, BlobError>, HubError> {
         let store = self.store.clone();
         let mut writer = tokio::task::spawn_blocking(move || store.blob_writer()).await??;
         let (mut next, mut attempts) = (0, 0);
@@ -281,7 +281,7 @@ impl Core {
                         writer = written.await??;
                         next += 1;
                     }
-                    Some(Err(BlobError::Failed(reason))) => return Err(EventError::Fetch(reason)),
+                    Some(Err(BlobError::Failed(reason))) => return Err(HubError::Fetch(reason)),
                     Some(Err(BlobError::Missing)) => break true,
                     Some(Err(BlobError::Damaged)) => return Ok(Err(BlobError::Damaged)),
                     None => break false,

@@ -4,35 +4,35 @@ use metrics::{Unit, counter, describe_counter, describe_gauge, gauge};
 
 use engine::job::Pool;
 
+pub const REDELIVERED: &str = "sci_recon_cluster_redelivered_total";
+pub const REFUSED: &str = "sci_recon_cluster_refused_total";
+pub const REJECTED: &str = "sci_recon_cluster_rejected_total";
+pub const REPLAYED: &str = "sci_recon_cluster_replayed_total";
+pub const MISMATCHED: &str = "sci_recon_cluster_mismatched_total";
+pub const REPAIRED: &str = "sci_recon_cluster_repaired_total";
+
+/// The counters of events, with their descriptions.
+const COUNTERS: [(&str, &str); 6] = [
+    (REDELIVERED, "Tiles that another worker took up because the first one fell silent."),
+    (REFUSED, "Reports that were refused: late, repeated, from the wrong worker, or unreadable."),
+    (
+        REJECTED,
+        "Results of workers that were rejected: impossible values, a wrong residual, or a result that differs from \
+         another worker's.",
+    ),
+    (REPLAYED, "Tiles that two workers have computed and whose results were compared."),
+    (MISMATCHED, "Tiles about which two workers disagree."),
+    (REPAIRED, "Tiles that were handed out again because their message or frames were lost."),
+];
+
 /// Describes the metrics of the hub.
 pub fn describe() {
     describe_gauge!("sci_recon_cluster_workers", "Workers on other machines, by pool.");
     describe_gauge!("sci_recon_cluster_tiles_out", "Tiles that are out with a pool.");
-    describe_counter!(
-        "sci_recon_cluster_redelivered_total",
-        "Tiles that another worker took up because the first one fell silent."
-    );
-    describe_counter!(
-        "sci_recon_cluster_refused_total",
-        "Reports that were refused: late, repeated, from the wrong worker, or unreadable."
-    );
-    describe_counter!(
-        "sci_recon_cluster_rejected_total",
-        "Results of workers that were rejected: impossible values, a wrong residual, or a result that differs from \
-         another worker's."
-    );
-    describe_counter!(
-        "sci_recon_cluster_replayed_total",
-        "Tiles that two workers have computed and whose results were compared."
-    );
-    describe_counter!(
-        "sci_recon_cluster_mismatched_total",
-        "Tiles about which two workers disagree."
-    );
-    describe_counter!(
-        "sci_recon_cluster_repaired_total",
-        "Tiles that were handed out again because their message or frames were lost."
-    );
+    for (name, description) in COUNTERS {
+        describe_counter!(name, description);
+        count(name, 0);
+    }
     describe_counter!(
         "sci_recon_cluster_blob_bytes_total",
         Unit::Bytes,
@@ -43,39 +43,14 @@ pub fn describe() {
         Unit::Seconds,
         "Time that the latest report of a worker waited until it was handled."
     );
-    redelivered(0);
-    refused(0);
-    rejected(0);
-    replayed(0);
-    mismatched(0);
-    repaired(0);
     bytes("out", 0);
     bytes("in", 0);
     lag(0.0);
 }
 
-pub fn redelivered(count: u64) {
-    counter!("sci_recon_cluster_redelivered_total").increment(count);
-}
-
-pub fn refused(count: u64) {
-    counter!("sci_recon_cluster_refused_total").increment(count);
-}
-
-pub fn rejected(count: u64) {
-    counter!("sci_recon_cluster_rejected_total").increment(count);
-}
-
-pub fn replayed(count: u64) {
-    counter!("sci_recon_cluster_replayed_total").increment(count);
-}
-
-pub fn mismatched(count: u64) {
-    counter!("sci_recon_cluster_mismatched_total").increment(count);
-}
-
-pub fn repaired(count: u64) {
-    counter!("sci_recon_cluster_repaired_total").increment(count);
+/// Adds to one of [`COUNTERS`].
+pub fn count(counter: &'static str, events: u64) {
+    counter!(counter).increment(events);
 }
 
 pub fn bytes(direction: &'static str, count: usize) {

@@ -11,7 +11,7 @@ use serde::de::DeserializeOwned;
 
 use super::accept::is_possible;
 use super::core::{Core, lock};
-use super::error::EventError;
+use super::error::HubError;
 use super::figures;
 use super::presence::MAX_WORKERS;
 use crate::nats::connection::ClusterError;
@@ -20,7 +20,7 @@ use crate::nats::names;
 use engine::job::Pool;
 use engine::pipeline::progress::is_history;
 use reconstruction::schedule::MAX_ITERATIONS;
-use store::{Begun, Heartbeat, RemoteBeat, StoreError, WorkerPlace, WorkerTakes};
+use store::{Begun, Claimant, Heartbeat, RemoteBeat, StoreError, WorkerPlace};
 
 /// Time between two transactions that record signs of life.
 const FLUSH: Duration = Duration::from_secs(1);
@@ -31,9 +31,7 @@ const MAX_NAME: usize = 255;
 
 impl Core {
     /// Subscribes to the messages of this kind from all pools.
-    ///
-    /// # Errors
-    /// If the message server denies the subscription.
+    /// Errors: the message server denies the subscription.
     pub async fn listen(&self, kind: &str) -> Result<Subscriber, ClusterError> {
         let subscribed = self.connection.client.subscribe(format!("sci.v1.{kind}.*")).await;
         subscribed.map_err(ClusterError::nats("listen to workers"))
@@ -173,7 +171,8 @@ impl Core {
             pool: Some(pool.to_string()),
             device: Some(device),
         };
-        let started = self.store.worker_started(worker, pid, &location, WorkerTakes::All);
+        let started =
+            self.store.worker_started(worker, pid, &location, Claimant::Pool(pool.as_str()));
         if let Err(error) = started.await {
             tracing::error!(%error, "a worker can't be recorded");
             return None;
@@ -186,7 +185,7 @@ impl Core {
     }
 
     /// Grants a worker an attempt, if no other worker owns the tile.
-    pub async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, EventError> {
+    pub async fn begin(&self, pool: &Pool, begin: Begin) -> Result<BeginAnswer, HubError> {
         let Begin { task, attempt, seq, delivery, worker } = begin;
         if self.leaves_to_another(pool, task, worker).await? {
             return Ok(BeginAnswer::Another);
@@ -195,7 +194,7 @@ impl Core {
         Ok(match self.store.remote_begin(task, (attempt, seq), delivery, worker).await? {
             Begun::Go(attempt, redelivered) => {
                 lock(&self.presence).begin(worker, task.0);
-                figures::redelivered(u64::from(redelivered));
+                figures::count(figures::REDELIVERED, u64::from(redelivered));
                 BeginAnswer::Go(attempt)
             }
             Begun::Over => BeginAnswer::Over,

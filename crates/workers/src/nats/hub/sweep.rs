@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use futures_util::future::join_all;
 
 use super::core::{Core, Undelivered, lock};
+use super::error::HubError;
 use super::figures;
 use crate::nats::connection::ClusterError;
 use crate::nats::names;
@@ -23,15 +24,6 @@ const POLL: Duration = Duration::from_millis(200);
 const STUCK_MARGIN: Duration = Duration::from_secs(10);
 /// Time without a worker after which a pool's tiles are taken back.
 const EMPTY_POOL_TIME: Duration = Duration::from_secs(60);
-
-/// Failure that interrupts a sweep.
-#[derive(Debug, thiserror::Error)]
-pub enum SweepError {
-    #[error(transparent)]
-    Cluster(#[from] ClusterError),
-    #[error(transparent)]
-    Store(#[from] StoreError),
-}
 
 impl Core {
     /// Sweeps until the future is dropped.
@@ -52,9 +44,7 @@ impl Core {
     }
 
     /// Creates missing streams, and records the identity of the stream of tiles.
-    ///
-    /// # Errors
-    /// If the message server refuses, or has no quorum.
+    /// Errors: the message server refuses, or has no quorum.
     pub async fn find_streams(&self) -> Result<(), ClusterError> {
         let identity = self.connection.make_streams().await?;
         let before = std::mem::replace(&mut *lock(&self.stream), identity.clone());
@@ -65,7 +55,7 @@ impl Core {
         Ok(())
     }
 
-    async fn sweep_once(self: &Arc<Self>, start: Instant) -> Result<(), SweepError> {
+    async fn sweep_once(self: &Arc<Self>, start: Instant) -> Result<(), HubError> {
         // 1. Creates the streams and consumers that a lost disk of the message server has taken with it.
         self.find_streams().await?;
         let known = self.pools().await;
@@ -118,7 +108,7 @@ impl Core {
                     self.repair(remote, "its message was lost").await?;
                 }
             }
-            Ok::<_, SweepError>(())
+            Ok::<_, HubError>(())
         });
         join_all(repaired).await.into_iter().collect::<Result<(), _>>()?;
         self.deliver(&out).await?;
@@ -153,7 +143,7 @@ impl Core {
     /// Repairs messages that are not delivered although workers wait. A consumer that moves between nodes may forget
     /// messages or stall (nats-server issues 6905 and 7680). The first repair recreates the consumer; the second hands
     /// the tile out again.
-    async fn deliver(&self, out: &[RemoteTask]) -> Result<(), SweepError> {
+    async fn deliver(&self, out: &[RemoteTask]) -> Result<(), HubError> {
         let (mut late, mut lost) = (BTreeSet::new(), Vec::new());
         {
             let mut undelivered = lock(&self.undelivered);
@@ -228,7 +218,7 @@ impl Core {
     async fn repair(&self, remote: &RemoteTask, reason: &str) -> Result<(), StoreError> {
         if self.store.remote_task(remote.task).await?.as_ref() == Some(remote) {
             tracing::warn!(task = %remote.task, reason, "a tile is handed out again");
-            figures::repaired(1);
+            figures::count(figures::REPAIRED, 1);
             self.store.remote_lost(remote, reason).await?;
             self.more.notify_one();
         }

@@ -5,6 +5,7 @@ use crate::operator::{
     DECAY, HIGH_CONTRAST, INDEPENDENT_CONTRAST, MAX_OPPOSITION, MIN_STATIC_SHARE,
     MIN_STATIC_VARIANCE, REFERENCE_RATIO, SensingOperator,
 };
+use crate::priors::tv::TvSpec;
 use crate::priors::{Denoiser, Network, Networks};
 use crate::schedule::Schedule;
 use crate::solver::reconstruct;
@@ -23,6 +24,8 @@ pub(crate) struct Problem {
 
 const GREY: f64 = 0.4;
 const PULL: f64 = 0.25;
+/// Step of the dual ascent of total variation.
+const TAU: f64 = 0.25;
 
 struct Pull;
 
@@ -43,6 +46,11 @@ impl Problem {
     pub(crate) fn random(seed: u64, method: &str) -> Self {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(seed);
         let size = (rng.random_range(1..5), rng.random_range(1..8), rng.random_range(1..40));
+        Self::with_size(size, rng, method)
+    }
+
+    /// A problem with masks of this size.
+    pub(crate) fn with_size(size: (usize, usize, usize), mut rng: impl Rng, method: &str) -> Self {
         let masks = Array3::from_shape_simple_fn(size, || 0.2 + 0.8 * rng.random::<f32>());
         let snapshots = rng.random_range(1..4);
         let y = (snapshots, size.1, size.2);
@@ -59,9 +67,14 @@ impl Problem {
 
     /// The solver's frames.
     pub(crate) fn solve(&self) -> Array3<f32> {
+        self.solve_with(&mut Pull)
+    }
+
+    /// The frames of the solver with these networks.
+    pub(crate) fn solve_with(&self, networks: &mut dyn Networks) -> Array3<f32> {
         let op = SensingOperator::new(self.masks.clone()).unwrap();
         let op = op.over(self.y.dim().0).unwrap();
-        reconstruct(&op, self.y.view(), &self.schedule, &mut Pull, &mut ()).unwrap().frames
+        reconstruct(&op, self.y.view(), &self.schedule, networks, &mut ()).unwrap().frames
     }
 
     pub(crate) fn pixels(&self) -> usize {
@@ -72,8 +85,16 @@ impl Problem {
         vec![0.0; self.y.dim().0 * self.masks.len()]
     }
 
+    /// The prior of the schedule: total variation, or the denoiser.
     pub(crate) fn denoise(&self, x: &mut [f64]) {
-        x.iter_mut().for_each(|x| *x += PULL * (GREY - *x));
+        match self.schedule.stages[0].prior.tv() {
+            None => x.iter_mut().for_each(|x| *x += PULL * (GREY - *x)),
+            Some(tv) => {
+                let (_, height, width) = self.masks.dim();
+                variation_along_time(x, height * width, tv);
+                x.chunks_mut(height * width).for_each(|frame| variation(frame, width, tv));
+            }
+        }
     }
 
     /// `P(w)` along the masks, or along `R C` (cosine by cosine, and bounded), with the target `y` or, accelerated,
@@ -143,6 +164,57 @@ impl Problem {
         }
         x
     }
+}
+
+/// Total variation of a frame: whole-image differences, as in the paper of Chambolle.
+pub(crate) fn variation(frame: &mut [f64], width: usize, tv: &TvSpec) {
+    let weight = f64::from(tv.tv_weight);
+    if weight == 0.0 {
+        return;
+    }
+    let count = frame.len();
+    let is_last = |pixel: usize| pixel % width + 1 == width;
+    let (mut down, mut right) = (vec![0.0; count], vec![0.0; count]);
+    let primal = |down: &[f64], right: &[f64]| -> Vec<f64> {
+        let at = |pixel: usize| {
+            let above = pixel.checked_sub(width).map_or(0.0, |above| down[above]);
+            let left = if pixel.is_multiple_of(width) { 0.0 } else { right[pixel - 1] };
+            frame[pixel] - down[pixel] + above - right[pixel] + left
+        };
+        (0..count).map(at).collect()
+    };
+    for _ in 0..tv.tv_updates {
+        let u = primal(&down, &right);
+        for pixel in 0..count {
+            let below = u.get(pixel + width).map_or(0.0, |below| below - u[pixel]);
+            let ahead = if is_last(pixel) { 0.0 } else { u[pixel + 1] - u[pixel] };
+            let norm = 1.0 + TAU / weight * below.hypot(ahead);
+            down[pixel] = (down[pixel] - TAU * below) / norm;
+            right[pixel] = (right[pixel] - TAU * ahead) / norm;
+        }
+    }
+    let result = primal(&down, &right);
+    frame.copy_from_slice(&result);
+}
+
+/// Total variation along time of a clip with `plane` pixels in a frame.
+fn variation_along_time(clip: &mut [f64], plane: usize, tv: &TvSpec) {
+    let weight = f64::from(tv.temporal_weight);
+    let mut dual = vec![0.0; clip.len() + plane];
+    // The dual field before a frame, then that after it.
+    let primal = |clip: &[f64], dual: &[f64]| -> Vec<f64> {
+        let fields = dual.iter().zip(&dual[plane..]);
+        clip.iter().zip(fields).map(|(x, (before, after))| x + before - after).collect()
+    };
+    for _ in 0..tv.tv_updates {
+        let u = primal(clip, &dual);
+        for voxel in plane..clip.len() {
+            let moved = dual[voxel] - TAU * (u[voxel] - u[voxel - plane]);
+            dual[voxel] = moved.clamp(-weight, weight);
+        }
+    }
+    let result = primal(clip, &dual);
+    clip.copy_from_slice(&result);
 }
 
 /// Largest difference between two clips.

@@ -1,0 +1,212 @@
+//! The GPU, its kernels, and the state of its driver.
+
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use pollster::block_on;
+use wgpu::{
+    Backends, Buffer, BufferDescriptor, BufferUsages, CommandEncoder, ComputePipeline,
+    ComputePipelineDescriptor, Device, DeviceDescriptor, DeviceLostReason, ErrorFilter, Instance,
+    InstanceDescriptor, InstanceFlags, Limits, MapMode, PollType, PowerPreference, Queue,
+    RequestAdapterOptions, include_wgsl,
+};
+
+use crate::error::{ReconError, Result};
+
+/// An open GPU. Threads may share it.
+pub struct Gpu {
+    name: String,
+    pub(super) device: Device,
+    pub(super) queue: Queue,
+    pub(super) kernels: Kernels,
+    fault: Arc<Mutex<Option<Fault>>>,
+}
+
+/// The compiled kernels.
+pub(super) struct Kernels {
+    pub(super) project: ComputePipeline,
+    pub(super) variation_along_time: ComputePipeline,
+    pub(super) variation: ComputePipeline,
+    pub(super) finish: ComputePipeline,
+}
+
+/// A failure that the driver reports outside of calls.
+enum Fault {
+    Lost(String),
+    Other(String),
+}
+
+impl Gpu {
+    /// Opens the first GPU with a Vulkan driver. Separate cards come before those of the processor.
+    ///
+    /// # Errors
+    /// There is none, or it lacks what the kernels need.
+    pub fn open() -> Result<Self> {
+        Self::open_with(|limits| limits)
+    }
+
+    /// As [`Gpu::open`], with limits derived from those that would be used.
+    pub(super) fn open_with(limits: impl FnOnce(Limits) -> Limits) -> Result<Self> {
+        let mut descriptor = InstanceDescriptor::new_without_display_handle();
+        (descriptor.backends, descriptor.flags) = (Backends::VULKAN, InstanceFlags::empty());
+        let power_preference = PowerPreference::HighPerformance;
+        let options = RequestAdapterOptions { power_preference, ..Default::default() };
+        let adapter = block_on(Instance::new(descriptor).request_adapter(&options));
+        let adapter = adapter.map_err(|error| {
+            ReconError::Runtime(format!(
+                "no GPU with a Vulkan driver was found: install libvulkan1 and the driver of the card, or use \
+                 --device cpu ({error})"
+            ))
+        })?;
+        let (info, has) = (adapter.get_info(), adapter.limits());
+        let driver = format!("{} {}", info.driver, info.driver_info);
+        // Servers refuse records with longer or other names.
+        let name = format!("{} ({})", info.name, driver.trim());
+        let is_plain = |char: &char| char.is_ascii_graphic() || *char == ' ';
+        let name: String = name.chars().filter(is_plain).take(64).collect();
+        let required_limits = limits(Limits {
+            max_buffer_size: has.max_buffer_size,
+            max_storage_buffer_binding_size: has.max_storage_buffer_binding_size,
+            ..Limits::default()
+        });
+        let descriptor = DeviceDescriptor { required_limits, ..Default::default() };
+        let opened = block_on(adapter.request_device(&descriptor));
+        let (device, queue) = opened.map_err(|error| {
+            ReconError::Runtime(format!("the GPU {name} can't run the solver's kernels: {error}"))
+        })?;
+        let fault = Arc::new(Mutex::new(None));
+        let shared = Arc::clone(&fault);
+        device.set_device_lost_callback(move |reason, text| {
+            let text = match reason {
+                DeviceLostReason::Destroyed => "it was closed".to_owned(),
+                DeviceLostReason::Unknown => text,
+            };
+            *shared.lock().unwrap_or_else(PoisonError::into_inner) = Some(Fault::Lost(text));
+        });
+        let shared = Arc::clone(&fault);
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            let mut fault = shared.lock().unwrap_or_else(PoisonError::into_inner);
+            fault.get_or_insert_with(|| Fault::Other(error.to_string()));
+        }));
+        let module = device.create_shader_module(include_wgsl!("kernels.wgsl"));
+        let kernel = |name| {
+            device.create_compute_pipeline(&ComputePipelineDescriptor {
+                label: Some(name),
+                layout: None,
+                module: &module,
+                entry_point: Some(name),
+                compilation_options: Default::default(),
+                cache: None,
+            })
+        };
+        let kernels = Kernels {
+            project: kernel("project"),
+            variation_along_time: kernel("variation_along_time"),
+            variation: kernel("variation"),
+            finish: kernel("finish"),
+        };
+        let gpu = Self { name, device, queue, kernels, fault };
+        gpu.check()?;
+        Ok(gpu)
+    }
+
+    /// Name of the card and of its driver.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Fails if the driver has reported a fault.
+    ///
+    /// # Errors
+    /// [`ReconError::DeviceLost`] from the loss of the device on, [`ReconError::Runtime`] once after another fault.
+    pub(super) fn check(&self) -> Result<()> {
+        let fault = || self.fault.lock().unwrap_or_else(PoisonError::into_inner);
+        if fault().is_none() {
+            return Ok(());
+        }
+        // After a loss all calls fail; its callback runs in a poll.
+        let polled = self.device.poll(PollType::Poll);
+        let mut fault = fault();
+        match &*fault {
+            Some(Fault::Lost(text)) => {
+                Err(ReconError::DeviceLost(format!("the GPU {} was lost ({text})", self.name)))
+            }
+            Some(Fault::Other(text)) => {
+                let text = polled.map_or_else(|error| format!("{text}; {error}"), |_| text.clone());
+                *fault = None;
+                Err(ReconError::Runtime(format!("the GPU {} failed: {text}", self.name)))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Buffers of these numbers of 32-bit values, all 0.
+    ///
+    /// # Errors
+    /// The device or its free memory is too small.
+    pub(super) fn buffers<const N: usize>(&self, lengths: [usize; N]) -> Result<[Buffer; N]> {
+        let limits = self.device.limits();
+        let limit = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        let bytes = |length: usize| 4 * length.max(4) as u64;
+        let largest = lengths.into_iter().map(bytes).max().unwrap_or_default();
+        if largest > limit {
+            return Err(ReconError::Runtime(format!(
+                "the GPU {} accepts arrays of up to {limit} bytes, but a tile needs {largest}: choose smaller tiles, \
+                 or use --device cpu",
+                self.name
+            )));
+        }
+        let scope = self.device.push_error_scope(ErrorFilter::OutOfMemory);
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
+        let buffers = lengths.map(|length| self.buffer(bytes(length), usage));
+        let total: u64 = lengths.into_iter().map(bytes).sum();
+        block_on(scope.pop()).map_or(Ok(buffers), |error| {
+            Err(ReconError::Runtime(format!(
+                "the GPU {} has too little free memory for {total} bytes: choose smaller tiles, run fewer workers on \
+                 this GPU, or use --device cpu ({error})",
+                self.name
+            )))
+        })
+    }
+
+    pub(super) fn buffer(&self, size: u64, usage: BufferUsages) -> Buffer {
+        let descriptor = BufferDescriptor { label: None, size, usage, mapped_at_creation: false };
+        self.device.create_buffer(&descriptor)
+    }
+
+    /// Submits commands, then reads the first `output.len()` values of a buffer.
+    ///
+    /// # Errors
+    /// As [`Gpu::check`].
+    pub(super) fn read(
+        &self,
+        mut commands: CommandEncoder,
+        buffer: &Buffer,
+        output: &mut [f32],
+    ) -> Result<()> {
+        let size = size_of_val(output) as u64;
+        let copy = self.buffer(size, BufferUsages::MAP_READ | BufferUsages::COPY_DST);
+        commands.copy_buffer_to_buffer(buffer, 0, &copy, 0, size);
+        self.queue.submit([commands.finish()]);
+        copy.map_async(MapMode::Read, .., |_| ());
+        let polled = self.device.poll(PollType::wait_indefinitely());
+        self.check()?;
+        let failed = |error: &dyn fmt::Display| {
+            ReconError::Runtime(format!("the GPU {} failed: {error}", self.name))
+        };
+        polled.map_err(|error| failed(&error))?;
+        let range = copy.get_mapped_range(..).map_err(|error| failed(&error))?;
+        output.copy_from_slice(bytemuck::cast_slice(&range));
+        Ok(())
+    }
+
+    pub(super) fn commands(&self) -> CommandEncoder {
+        self.device.create_command_encoder(&Default::default())
+    }
+}
+
+impl fmt::Debug for Gpu {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Gpu").field(&self.name).finish()
+    }
+}
