@@ -2,8 +2,8 @@
 //!
 //! The displacement is the one at which a short reconstruction predicts pixels best that it has not seen. Whole pixels are
 //! searched first. Then a quadratic is fitted to the hold-out error around the best displacement, on ever finer grids. The
-//! error itself is minimised, because a linearised step is biased towards 0 by the errors of the frames. It also decides how
-//! the masks are interpolated.
+//! error itself is minimised, because a linearised step is biased towards 0 by the errors of the frames. Its ratio to the error
+//! of the same masks elsewhere decides how the masks are interpolated.
 //!
 //! A correction is accepted only if it lowers the error significantly at pixels that took no part in the search.
 
@@ -96,6 +96,13 @@ pub struct Correction {
     pub interpolation: Interpolation,
 }
 
+impl Correction {
+    /// Moves the masks away by [`ELSEWHERE`]. At the same fractions of a pixel they lose as much contrast, and fit nothing.
+    fn elsewhere(self) -> Self {
+        Self { shift: self.shift.map(|shift| shift - ELSEWHERE.copysign(shift)), ..self }
+    }
+}
+
 /// The estimated displacement of masks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Registration {
@@ -167,12 +174,7 @@ pub fn register(
     let norm = search.draws[1].norm(search.y.view());
     let length = best.shift[0].hypot(best.shift[1]);
     let converged = has_settled && best.shift.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
-    // Masks elsewhere with the same fractions of a pixel have lost as much contrast, but fit nothing.
-    let elsewhere = best.shift.map(|shift| shift - ELSEWHERE.copysign(shift));
-    let Some(wrong) = search.errors(Correction { shift: elsewhere, ..best }, 1, ITERATIONS.1)?
-    else {
-        return Ok(None);
-    };
+    let Some(wrong) = search.errors(best.elsewhere(), 1, ITERATIONS.1)? else { return Ok(None) };
     let is_explained = after.iter().sum::<f64>() < EXPLAINED * wrong.iter().sum::<f64>();
     Ok(Some(Registration {
         correction: best,
@@ -255,7 +257,7 @@ impl<'a> Search<'a> {
         let masks = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
         let y = y.slice(inner).insert_axis(Axis(0)).to_owned();
         let draws = draw(&y);
-        let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + Interpolation::ALL.len()) + 3;
+        let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
         let total = ((2 * REACH + 1).pow(2) * ITERATIONS.0 + runs * ITERATIONS.1) as f64;
         Ok(Self { masks, interpolated, y, draws, proceed, done: 0.0, total })
     }
@@ -312,7 +314,8 @@ impl<'a> Search<'a> {
         Ok(best.map(|(_, place)| place))
     }
 
-    /// The interpolation with the smallest error. Shifts by whole pixels have the default: none is better there.
+    /// The interpolation with the smallest error relative to that of the same masks elsewhere, since a loss of contrast lowers
+    /// both. Shifts by whole pixels have the default: none is better there.
     fn interpolation(&mut self, shift: [f64; 2]) -> Result<Interpolation> {
         let mut best = (f64::INFINITY, Interpolation::default());
         if shift.iter().all(|shift| shift.fract() == 0.0) {
@@ -321,9 +324,10 @@ impl<'a> Search<'a> {
         for interpolation in Interpolation::ALL {
             let place = Correction { shift, interpolation };
             let Some(errors) = self.errors(place, 0, ITERATIONS.1)? else { continue };
-            let error: f64 = errors.iter().sum();
-            if error < best.0 {
-                best = (error, interpolation);
+            let Some(wrong) = self.errors(place.elsewhere(), 0, ITERATIONS.1)? else { continue };
+            let ratio = errors.iter().sum::<f64>() / wrong.iter().sum::<f64>();
+            if ratio < best.0 {
+                best = (ratio, interpolation);
             }
         }
         Ok(best.1)
