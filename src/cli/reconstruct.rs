@@ -165,8 +165,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
 
     let (started, before) = (Instant::now(), cpu_seconds());
+    input.register(arguments.registration)?;
+    // The scale follows from the moved masks, as in a job.
     let white = input.white()?;
-    input.register(arguments.registration, white)?;
     let solver = match &setup.model {
         Some(model) => Solver::Network(&model.file),
         None => Solver::Schedule(&setup.schedule),
@@ -428,7 +429,8 @@ impl<'a> Input<'a> {
 
     /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
     /// known.
-    fn register(&mut self, request: RegistrationRequest, white: f32) -> Result<()> {
+    fn register(&mut self, request: RegistrationRequest) -> Result<()> {
+        let white = self.white()?;
         let masks = self.masks.array.view();
         let is_coloured = self.mosaic.is_some() || self.sources.masks.dispersion.is_some();
         if request.error(is_coloured).is_some() {

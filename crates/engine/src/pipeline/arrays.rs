@@ -43,16 +43,25 @@ impl Arrays {
         Reader::open(&self.masks.0, &Limits::default())
     }
 
-    /// The sum of all masks \[H,W\], in which pixels that were not measured count as 0. It reads one mask at a time.
+    /// The sum of all masks \[H,W\] after their correction, in which pixels that were not measured count as 0. It reads one
+    /// mask at a time, and moves their sum.
     pub fn light(&self, monitor: &Monitor) -> Result<Array2<f32>> {
+        let known = |mask: f32| if mask.is_nan() { 0.0 } else { mask };
         let masks = self.masks()?;
         let mut light = Array2::zeros((masks.info().height, masks.info().width));
         for frame in 0..masks.info().frames {
             monitor.check()?;
-            light +=
-                &plane(&masks, frame)?.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+            let mask = plane(&masks, frame)?;
+            light += &(if self.correction.is_some() { mask } else { mask.mapv_into(known) });
         }
-        Ok(light)
+        let Some(correction) = self.correction else { return Ok(light) };
+        // Moved masks are clipped to [0,1], so the sum is moved as a mean.
+        let frames = masks.info().frames as f32;
+        let mean = (light / frames).insert_axis(Axis(0));
+        let (_, height, width) = mean.dim();
+        let moved = Interpolated::new(mean.view(), correction.interpolation);
+        let moved = moved.window(correction.shift, 0..height, 0..width).remove_axis(Axis(0));
+        Ok(moved.mapv_into(|mean| frames * known(mean)))
     }
 
     /// One snapshot \[H,W\].
