@@ -4,10 +4,11 @@
     python registration.py report --out FOLDER [--markdown]
 
 DATA has photographs in photos/train and photos/val. A camera moves over them behind masks of four kinds, Cr 8 to 20, with
-noise of 0 to 10. Binary masks move as areas of a pattern with eight times the resolution, blurred or not. Masks of the
-optics move by the Fourier shift theorem. The program interpolates in other ways. Each case is reconstructed with the
-masks of the calibration, registered ones and the true ones. Right masks and flipped ones must be left alone. `run` appends a line to a
-file in FOLDER for this binary: an interrupted run continues where it stopped. The last line of a report is JSON.
+noise of 0 to 10. A pixel of a mask is the mean of the light on its area. So masks are simulated on five times as many
+pixels, moved by whole ones of these, and averaged; `--motion spline` moves the masks by cubic splines instead. Each case
+is reconstructed with the masks of the calibration, registered ones and the true ones. Right masks and flipped ones must be
+left alone. PSNR leaves out the border, for which moved masks are unknown. `run` appends a line to a file in FOLDER for this
+binary: an interrupted run continues where it stopped. The last line of a report is JSON.
 """
 import argparse
 import concurrent.futures
@@ -20,6 +21,7 @@ import tempfile
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from wrong_inputs import Runs, panned, read
 
@@ -28,35 +30,33 @@ RATIOS = 8, 10, 12, 16, 20
 SIGMAS = 0, 2, 5, 10
 STEPS = 0, .3, 1, 2
 REACH = 4       # pixels
-FINE = 8        # cells of a pixel
+FINE = 5        # cells of a pixel; the grids of the search have steps of 1/8
 BORDER = 16     # pixels around a picture, into which masks move
 WORSE = .1      # dB that an unnecessary correction may cost
 
 
 # ---------------------------------------------------------------- cases
-def areas(pattern, cells, blur, side):
-    """Masks [B,side,side] from a pattern [B,n,n] that moved down and to the right by cells, and that a lens blurs."""
-    def mask(frame):
-        fine = np.kron(frame, np.ones((FINE, FINE), np.float32))
-        fine = cv2.GaussianBlur(fine, (0, 0), blur * FINE) if blur else fine
-        rows, columns = (BORDER * FINE - cell for cell in cells)
-        return fine[rows:rows + side * FINE, columns:columns + side * FINE].reshape(side, FINE, side, FINE).mean((1, 3))
-    return np.stack([mask(frame) for frame in pattern])
+def fine(binary, kind, ratio, blur, side, rng):
+    """The light [B,n,n] of masks on cells, FINE to a pixel, as a lens blurs it."""
+    if kind.startswith('iid'):
+        light = (rng.random((ratio, side, side)) < .5).astype(np.float32).repeat(FINE, 1).repeat(FINE, 2)
+    else:
+        light = simulated(binary, kind, ratio, side * FINE, int(rng.integers(1 << 30)))
+    return np.stack([cv2.GaussianBlur(frame, (0, 0), blur * FINE) for frame in light]) if blur else light
 
 
-def fourier(masks, shift, side):
-    """The middle of masks [B,n,n] after a shift down and to the right, clipped to [0,1]."""
-    rows, columns = (np.fft.fftfreq(length) for length in masks.shape[1:])
-    phase = np.exp(-2j * np.pi * (rows[:, None] * shift[0] + columns * shift[1]))
-    moved = np.fft.ifft2(np.fft.fft2(masks) * phase).real.clip(0, 1)
-    return moved[:, BORDER:BORDER + side, BORDER:BORDER + side].astype(np.float32)
+def areas(light, cells):
+    """Masks as means over the areas of pixels, after the light moved down and to the right by cells."""
+    frames, side, _ = light.shape
+    return np.roll(light, cells, (1, 2)).reshape(frames, side // FINE, FINE, side // FINE, FINE).mean((2, 4))
 
 
 class Case:
-    def __init__(self, binary, files, index, side):
-        rng = np.random.default_rng([11, index])
+    def __init__(self, a, files, index):
+        rng, side = np.random.default_rng([11, index]), a.side
         self.kind, self.ratio, self.sigma = KINDS[index % 4], int(rng.choice(RATIOS)), float(SIGMAS[index // 4 % 4])
-        self.step, self.blur, scale = float(rng.choice(STEPS)), 0, float(rng.choice([.3, .5, .8]))
+        self.step, scale = float(rng.choice(STEPS)), float(rng.choice([.3, .5, .8]))
+        self.blur = float(rng.uniform(.6, .8)) if self.kind == 'iid-blurred' else 0
         # A third of the shifts is shorter than a pixel.
         reach = 1 if index // 4 % 3 == 1 else REACH
         cells = rng.integers(-reach * FINE, reach * FINE + 1, 2)
@@ -64,14 +64,10 @@ class Case:
         self.shift, file = (cells / FINE).tolist(), files[index % len(files)]
         photo = cv2.imread(file, cv2.IMREAD_GRAYSCALE)
         self.photo, self.frames = pathlib.Path(file).stem, panned(photo, self.ratio, side, self.step, scale).astype(np.float32)
-        wide = side + 2 * BORDER
-        if self.kind.startswith('iid'):
-            self.blur = float(rng.uniform(.6, .8)) if self.kind == 'iid-blurred' else 0
-            pattern = (rng.random((self.ratio, wide, wide)) < .5).astype(np.float32)
-            self.calibrated, self.moved = (areas(pattern, cells, self.blur, side) for cells in ([0, 0], cells))
-        else:
-            masks = simulated(binary, self.kind, self.ratio, wide, index)
-            self.calibrated, self.moved = (fourier(masks, shift, side) for shift in ([0, 0], self.shift))
+        light = fine(a.binary, self.kind, self.ratio, self.blur, side + 2 * BORDER, rng)
+        still = areas(light, [0, 0])
+        moved = areas(light, cells) if a.motion == 'areas' else np.stack([ndimage.shift(mask, self.shift, mode='mirror') for mask in still]).clip(0, 1)
+        self.calibrated, self.moved = (masks[:, BORDER:-BORDER, BORDER:-BORDER] for masks in (still, moved))
         self.noise = (self.sigma / 255 * rng.standard_normal((side, side))).astype(np.float32)
 
     def about(self):
@@ -79,12 +75,13 @@ class Case:
 
 
 def simulated(binary, kind, ratio, side, seed):
-    """Masks [B,side,side] of the optics."""
+    """Masks [B,side,side] of the optics, with FINE sensor pixels to a pixel of the lithography mask."""
     with tempfile.TemporaryDirectory() as folder:
         folder = pathlib.Path(folder)
-        np.save(folder / 'scene.npy', np.full((ratio, side, side), .5, np.float32))
+        np.save(folder / 'scene.npy', np.full((ratio, side, side), 128, np.uint8))
+        (folder / 'optics.toml').write_text(f'[relay]\nmagnification = {FINE}\n')
         subprocess.run([binary, 'simulate', '--frames', folder / 'scene.npy', '--compression-ratio', str(ratio), '--pattern', kind,
-                        '--seed', str(seed), '--out', folder / 'out'], check=True, stdout=subprocess.DEVNULL)
+                        '--seed', str(seed), '--optics', folder / 'optics.toml', '--out', folder / 'out'], check=True, stdout=subprocess.DEVNULL)
         return np.load(folder / 'out/masks.npy')
 
 
@@ -96,7 +93,7 @@ class Bench(Runs):
     def case(self, index):
         if index in self.done:
             return
-        case = Case(self.a.binary, self.files, index, self.a.side)
+        case = Case(self.a, self.files, index)
         runs = {}
         for drift, true in (('drift', case.moved), ('none', case.calibrated)):
             y = (true * case.frames).sum(0) + case.noise
@@ -118,7 +115,8 @@ class Bench(Runs):
             if done.returncode not in (0, 3):
                 sys.exit(f'a reconstruction failed: {done.stderr}')
             report, manifest = json.loads(done.stdout), json.loads((folder / 'out/manifest.json').read_text())
-        return {'psnr_db': report['psnr_unit_db'], 'cpu_s': report['cpu_seconds'], 'registration': manifest['content'].get('registration')}
+            error = (np.load(folder / 'out/frames.npy').reshape(truth.shape) - truth)[:, REACH:-REACH, REACH:-REACH]
+        return {'psnr_db': float(-10 * np.log10((error ** 2).mean())), 'whole_db': report['psnr_unit_db'], 'cpu_s': report['cpu_seconds'], 'registration': manifest['content'].get('registration')}
 
 
 def run(a):
@@ -196,6 +194,7 @@ def main():
     runs.add_argument('--data', required=True)
     runs.add_argument('--cases', type=int, default=40)
     runs.add_argument('--first', type=int, default=0, help='number of the first case; use others than the first 40 for tuning')
+    runs.add_argument('--motion', choices=['areas', 'spline'], default='areas')
     runs.add_argument('--algorithm', default='gap-tv')
     runs.add_argument('--side', type=int, default=128, help='side of the images in pixels')
     runs.add_argument('--parallel', type=int, default=os.cpu_count(), help='reconstructions at the same time')

@@ -165,8 +165,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
 
     let (started, before) = (Instant::now(), cpu_seconds());
+    input.register(arguments.registration)?;
+    // The scale follows from the moved masks, as in a job.
     let white = input.white()?;
-    input.register(arguments.registration, white)?;
     let solver = match &setup.model {
         Some(model) => Solver::Network(&model.file),
         None => Solver::Schedule(&setup.schedule),
@@ -428,7 +429,8 @@ impl<'a> Input<'a> {
 
     /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
     /// known.
-    fn register(&mut self, request: RegistrationRequest, white: f32) -> Result<()> {
+    fn register(&mut self, request: RegistrationRequest) -> Result<()> {
+        let white = self.white()?;
         let masks = self.masks.array.view();
         let is_coloured = self.mosaic.is_some() || self.sources.masks.dispersion.is_some();
         if request.error(is_coloured).is_some() {
@@ -448,8 +450,8 @@ impl<'a> Input<'a> {
             self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
             self.findings.extend(registered.findings());
         }
-        if let Some(shift) = registered.as_ref().and_then(Registered::applied_shift) {
-            let moved = registration::moved(masks, shift);
+        if let Some(correction) = registered.as_ref().and_then(Registered::correction) {
+            let moved = registration::moved(masks, correction);
             for mut snapshot in self.measurement.array.outer_iter_mut() {
                 let first = moved.index_axis(Axis(0), 0);
                 snapshot.zip_mut_with(&first, |y, mask| {

@@ -13,12 +13,12 @@ use super::arguments::{
 use super::client::{Client, Result};
 use super::fields::Role;
 use engine::job::{
-    Algorithm, CalibrationId, Dispersion, Mosaic, RegistrationRequest, Sequence, Sha256,
+    Algorithm, CalibrationId, Dispersion, JobId, Mosaic, RegistrationRequest, Sequence, Sha256,
 };
 
 /// Options of the calibration, the measurement and the job.
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("camera").args(["masks", "calibration"]).required(true).multiple(true))]
+#[command(group = ArgGroup::new("camera").args(["masks", "calibration", "registration_of"]).required(true).multiple(true))]
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
     #[arg(long, value_name = "ID", help_heading = CALIBRATION,
@@ -27,6 +27,11 @@ pub(super) struct SubmissionArguments {
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
+    /// A job that has moved its masks: they become a calibration. The same job creates one calibration only.
+    #[arg(long, value_name = "JOB", help_heading = CALIBRATION,
+          conflicts_with_all = ["calibration", "masks", "masks_array", "masks_axes", "masks_crop", "masks_frames",
+                                "masks_packing", "masks_full_scale", "mosaic", "bad_pixels"])]
+    registration_of: Option<JobId>,
     #[command(flatten, next_help_heading = CALIBRATION)]
     mask_file: MaskFileArguments,
     /// The stored number in the masks that means 1, fully open [default: that of their type].
@@ -121,27 +126,34 @@ impl SubmissionArguments {
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
         let dispersion = self.dispersion.resolve()?;
-        let calibration = match (&self.calibration, &self.masks) {
-            (Some(_), _) if dispersion.is_some() => {
+        // One file of masks, or one job, creates one calibration for all clients.
+        let create = async |body: Value| {
+            let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
+            client.create_checked("/v1/calibrations", &body, &key).await
+        };
+        let calibration = match (&self.calibration, &self.masks, &self.registration_of) {
+            (Some(_), ..) | (_, None, Some(_)) if dispersion.is_some() => {
                 let text =
                     "--dispersion-offsets belongs to --masks: a calibration has its own dispersion";
                 return Err(CliError::Input(text.into()).into());
             }
-            (Some(id), _) => id.to_string(),
-            (None, Some(masks)) => {
+            (Some(id), ..) => id.to_string(),
+            (None, Some(masks), _) => {
                 let bad_pixels = match &self.mask_file.bad_pixels {
                     Some(map) => Some(client.upload_with_bar(map).await?),
                     None => None,
                 };
                 let sent = client.upload_with_bar(masks).await?;
                 let body = self.calibration_request(sent, bad_pixels, dispersion);
-                // One file of masks creates one calibration for all clients.
-                let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-                let created = client.create_checked("/v1/calibrations", &body, &key).await;
-                created.map_err(|error| error.about(Role::Masks, masks))?
+                create(body).await.map_err(|error| error.about(Role::Masks, masks))?
             }
-            (None, None) => {
-                let text = "give --masks FILE or --calibration ID";
+            (None, None, Some(job)) => {
+                let mut body = Map::from_iter([("registration_of".to_owned(), json!(job))]);
+                add(&mut body, "name", json!(self.masks_name));
+                create(Value::Object(body)).await?
+            }
+            (None, None, None) => {
+                let text = "give --masks FILE, --calibration ID or --registration-of JOB";
                 return Err(CliError::Input(text.into()).into());
             }
         };

@@ -15,7 +15,7 @@ use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Problem, REQUEST_ID, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Limit, ListQuery, NoQuery, PageBody, Renaming};
-use engine::job::{CheckLimits, InvalidId, Lab, Submission, ThingId};
+use engine::job::{CheckLimits, InvalidId, JobState, Lab, Submission, ThingId};
 use store::{
     Asked, Filter, Inserted, Made, NewRequest, Page, Request, RequestKey, Resource, StoreError,
 };
@@ -227,11 +227,30 @@ async fn wait_for_check(
     Ok(app.store.find_request(&lab, id).await?.is_some())
 }
 
-/// Rejects a request that refers to a calibration or upload that does not exist.
+/// Rejects a request that refers to a calibration, job or upload that does not exist or does not fit.
 async fn check_references(app: &App, lab: &Lab, submission: &Submission) -> Result<()> {
     if let Some(calibration) = submission.calibration() {
         let result = app.store.calibration(lab, calibration).await;
         result.map_err(|error| ApiError::reference("/calibration", error))?;
+    }
+    if let Some(id) = submission.registration_of() {
+        let place = "/registration_of";
+        let job = app.store.job(lab, id).await;
+        let job = job.map_err(|error| ApiError::reference(place, error))?;
+        if job.state != JobState::Succeeded {
+            let state: &str = job.state.into();
+            let detail = format!(
+                "job {id} is {state}; a corrected calibration needs a job that has succeeded"
+            );
+            return Err(ApiError::new(Code::IllegalState, detail).at(place));
+        }
+        if job.spec.registered.and_then(|registered| registered.correction()).is_none() {
+            let detail = format!(
+                "job {id} has not moved its masks: use calibration {}",
+                job.spec.calibration
+            );
+            return Err(ApiError::field(place, detail));
+        }
     }
     for (pointer, upload) in submission.uploads() {
         let result = app.store.upload(lab, upload).await;

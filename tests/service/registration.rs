@@ -104,6 +104,57 @@ async fn moved_masks_are_corrected_and_reported() {
 }
 
 #[tokio::test]
+async fn corrected_masks_become_a_calibration() {
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let calibration = id(&app.calibrate(masks()).await.expect(201));
+    let moved = id(&app.measure(&calibration, snapshot([6, 3])).await.expect(201));
+    let (auto, corrected) = run(&app, &moved, &json!("auto")).await;
+    let save = async |job: &Value| {
+        let body = json!({"registration_of": job["id"], "name": "after the drift"});
+        app.post("/v1/calibrations", &body).await
+    };
+    let saved = save(&auto).await.expect(201).json();
+    let Scene { frames, height, width, .. } = SCENE;
+    for (fact, expected) in [
+        ("name", json!("after the drift")),
+        ("frames", json!(frames)),
+        ("height", json!(height)),
+        ("width", json!(width)),
+        ("format", json!("registration")),
+    ] {
+        assert_eq!(saved[fact], expected, "{saved:#}");
+    }
+    // The saved masks fit the measurement, and serve it as well as the correction within the job.
+    let saved = saved["id"].as_str().unwrap();
+    let again = id(&app.measure(saved, snapshot([6, 3])).await.expect(201));
+    let (fits, frames) = run(&app, &again, &json!("auto")).await;
+    assert!(fits["registered"]["applied"] == false && !has_moved_masks(&fits), "{fits:#}");
+    let quality = [&corrected, &frames].map(|file| psnr(SCENE, 0, &values(file)));
+    assert!(quality[1] > quality[0] - 0.3, "{quality:?}");
+
+    let (off, _) = run(&app, &moved, &json!("off")).await;
+    let cancelled = app
+        .submit(&json!({"measurement": moved, "algorithm": "gap-tv", "registration": "auto"}))
+        .await;
+    // A job that has started ends a little later.
+    app.post(&format!("/v1/jobs/{cancelled}/cancel"), &json!({})).await;
+    let cancelled = app.ended(&cancelled).await;
+    assert_eq!(cancelled["state"], "cancelled", "{cancelled:#}");
+    let refused = [(&off, 422, "invalid_request"), (&cancelled, 409, "illegal_state")];
+    for (job, status, code) in refused {
+        let answer = save(job).await;
+        answer.problem(status, code);
+        assert_eq!(answer.json()["errors"][0]["pointer"], "/registration_of", "{answer:?}");
+    }
+    let body = json!({"registration_of": auto["id"], "full_scale": 255});
+    app.post("/v1/calibrations", &body).await.problem(422, "invalid_request");
+    app.sign_in(&app.token(&["create", "--lab", "another"]));
+    let unknown = save(&auto).await;
+    unknown.problem(422, "invalid_request");
+    assert_eq!(unknown.json()["errors"][0]["pointer"], "/registration_of");
+}
+
+#[tokio::test]
 async fn masks_that_fit_are_used_unchanged() {
     let app = TestApp::with(&["--workers", "2"]).await;
     let calibration = id(&app.calibrate(masks()).await.expect(201));

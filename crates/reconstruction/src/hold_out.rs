@@ -91,7 +91,7 @@ impl HoldOut {
     }
 
     /// `||y - m||^2`, where `m` is the mean of the other pixels around each.
-    pub(super) fn neighbour_error(&self, y: ArrayView3<'_, f32>) -> f64 {
+    fn neighbour_error(&self, y: ArrayView3<'_, f32>) -> f64 {
         let mut is_held_out = Array3::from_elem(y.dim(), false);
         self.pixels.iter().for_each(|&pixel| is_held_out[pixel] = true);
         let (_, height, width) = y.dim();

@@ -2,7 +2,8 @@
 //!
 //! The displacement is the one at which a short reconstruction predicts pixels best that it has not seen. Whole pixels are
 //! searched first. Then a quadratic is fitted to the hold-out error around the best displacement, on ever finer grids. The
-//! error itself is minimised, because a linearised step is biased towards 0 by the errors of the frames.
+//! error itself is minimised, because a linearised step is biased towards 0 by the errors of the frames. Its ratio to the error
+//! of the same masks elsewhere decides how the masks are interpolated.
 //!
 //! A correction is accepted only if it lowers the error significantly at pixels that took no part in the search.
 
@@ -10,6 +11,8 @@ use std::ops::Range;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis, s};
 use rand::{RngExt, SeedableRng};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use super::crop;
 use super::error::{ReconError, Result, shape_text};
@@ -20,8 +23,8 @@ use super::solver;
 
 /// Largest displacement along each axis that is searched, in pixels.
 pub const REACH: usize = 4;
-/// Pixels around a window that its interpolation needs: a spline's filter falls below 1e-7 within 12 pixels.
-pub const MARGIN: usize = 12 + REACH + 1;
+/// Pixels around a window that its interpolation needs: a spline's filter falls below 2e-6 within 16 pixels.
+pub const MARGIN: usize = 16 + REACH + 1;
 /// Shortest side in pixels of a piece that is compared.
 const SHORTEST_SIDE: usize = 32;
 /// Share of pixels that are held out.
@@ -30,9 +33,11 @@ const SHARE: f64 = 0.1;
 const ITERATIONS: (usize, usize) = (8, 24);
 /// Distances in pixels between the displacements of the first grids of the refinement.
 const STEPS: [f64; 2] = [0.5, 0.25];
-/// Distance in pixels between the displacements of the last grids, and their largest number.
-const FINEST: (f64, usize) = (0.125, 5);
-/// Largest move of the last grid, in distances of its displacements. A longer one means that the search has not converged.
+/// Distances in pixels between the displacements of the last grids: each grid is repeated until it has settled.
+const LAST_STEPS: [f64; 3] = [0.125, 0.0625, 0.03125];
+/// Largest number of these grids.
+const MAX_GRIDS: usize = 7;
+/// Largest move of a grid that has settled, in distances of its displacements.
 const SETTLED: f64 = 0.5;
 /// Smallest t-statistic of an accepted correction.
 const SIGNIFICANT: f64 = 3.0;
@@ -41,21 +46,69 @@ const SIGNIFICANT: f64 = 3.0;
 const MIN_ENERGY: f32 = 0.05;
 /// Width in pixels of the border of a defect that is filled from its surroundings.
 const FILLED: usize = 3;
-/// Distance from 0 and 1 of an intermediate value of a mask, and the largest share of such values in binary masks.
-const INTERMEDIATE: f32 = 0.1;
-const MAX_INTERMEDIATE: f64 = 0.02;
-/// Largest hold-out error of an accepted correction, relative to the error of the mean of the pixels around. Right masks stay
-/// below 0.2. Masks of another camera stay above 0.5, but a shift by half a pixel lowers their contrast, and so their error.
+/// Largest hold-out error of an accepted correction, relative to the error of the same masks [`ELSEWHERE`]. Interpolation
+/// lowers the contrast of wrong masks, and so their error. Their ratio stays above 0.7, that of most right masks below 0.1.
 const EXPLAINED: f64 = 0.5;
+/// Distance in whole pixels along both axes of the masks with which this error is compared.
+const ELSEWHERE: f64 = REACH as f64;
 /// Smallest correction in pixels; a smaller one changes nothing that can be seen.
 const SMALLEST: f64 = 0.03;
 
-/// The displacement of masks against their calibration.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Registration {
+/// Interpolation of masks by splines. A pixel of a mask is the mean of the light on its area.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Interpolation {
+    /// Exact for sharp masks with uniform light on each pixel: a moved pixel covers parts of its neighbours.
+    Linear,
+    /// For masks between these.
+    #[default]
+    Cubic,
+    /// Most accurate for masks that a lens has blurred.
+    Quintic,
+}
+
+impl Interpolation {
+    const ALL: [Self; 3] = [Self::Linear, Self::Cubic, Self::Quintic];
+
+    fn degree(self) -> usize {
+        2 * self as usize + 1
+    }
+
+    /// Poles of the filter from samples to coefficients, and its gain (Unser 1999).
+    fn filter(self) -> (Vec<f64>, f64) {
+        let (a, b) = (17745f64.sqrt() / 2.0, 105f64.sqrt() / 2.0);
+        match self {
+            Self::Linear => (vec![], 1.0),
+            Self::Cubic => (vec![3f64.sqrt() - 2.0], 6.0),
+            Self::Quintic => {
+                (vec![(67.5 - a).sqrt() + b - 6.5, (67.5 + a).sqrt() - b - 6.5], 120.0)
+            }
+        }
+    }
+}
+
+/// A displacement of masks against their calibration.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Correction {
     /// Pixels by which the masks have moved down and to the right.
     pub shift: [f64; 2],
-    /// Standard error of each.
+    /// Interpolation between the pixels of the calibrated masks.
+    pub interpolation: Interpolation,
+}
+
+impl Correction {
+    /// Moves the masks away by [`ELSEWHERE`]. At the same fractions of a pixel they lose as much contrast, and fit nothing.
+    fn elsewhere(self) -> Self {
+        Self { shift: self.shift.map(|shift| shift - ELSEWHERE.copysign(shift)), ..self }
+    }
+}
+
+/// The estimated displacement of masks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Registration {
+    /// The displacement with the smallest hold-out error.
+    pub correction: Correction,
+    /// Standard error of the shift along rows and columns.
     pub uncertainty: [f64; 2],
     /// `||y - Hv||^2 / ||y||^2` at hold-out pixels with the masks of the calibration.
     pub error_before: f64,
@@ -93,51 +146,38 @@ pub fn register(
     y: ArrayView2<'_, f32>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Option<Registration>> {
-    let (_, height, width) = masks.dim();
-    if y.dim() != (height, width) || height.min(width) < SHORTEST_SIDE + 2 * MARGIN {
-        return Err(ReconError::Shape {
-            what: "the piece of a registration",
-            found: format!("{} and {}", shape_text(masks.shape()), shape_text(y.shape())),
-            expected: format!("one size of at least {} pixels", SHORTEST_SIDE + 2 * MARGIN),
-        });
-    }
-    let inner = s![MARGIN..height - MARGIN, MARGIN..width - MARGIN];
-    let interpolated = Interpolated::new(masks);
-    let masks = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
-    let y = y.slice(inner).insert_axis(Axis(0)).to_owned();
-    let draws = draw(&y);
-    if draws.iter().any(|draw| draw.pixels.is_empty()) {
+    let mut search = Search::new(masks, y, proceed)?;
+    if search.draws.iter().any(|draw| draw.pixels.is_empty()) {
         return Ok(None);
     }
-    let grids = STEPS.len() + FINEST.1;
-    let total = ((2 * REACH + 1).pow(2) * ITERATIONS.0 + (grids * 9 + 2) * ITERATIONS.1) as f64;
-    let mut search = Search { masks, interpolated, y, proceed, done: 0.0, total };
-    let Some(mut best) = search.whole_pixels(&draws[0])? else { return Ok(None) };
+    let Some(mut best) = search.whole_pixels()? else { return Ok(None) };
     for step in STEPS {
-        let Some(fit) = search.refine(best, step, &draws[0])? else { return Ok(None) };
-        best = fit.minimum;
+        let Some(fit) = search.refine(best, step)? else { return Ok(None) };
+        best.shift = fit.minimum;
     }
     let (mut uncertainty, mut has_settled) = ([0.0; 2], false);
-    for _ in 0..FINEST.1 {
-        let Some(fit) = search.refine(best, FINEST.0, &draws[0])? else { return Ok(None) };
-        (best, uncertainty, has_settled) = (fit.minimum, fit.uncertainty, fit.has_settled);
+    let mut steps = LAST_STEPS.into_iter().peekable();
+    for _ in 0..MAX_GRIDS {
+        let Some(step) = steps.peek() else { break };
+        best.interpolation = search.interpolation(best.shift)?;
+        let Some(fit) = search.refine(best, *step)? else { return Ok(None) };
+        (best.shift, uncertainty, has_settled) = (fit.minimum, fit.uncertainty, fit.has_settled);
         if has_settled {
-            break;
+            steps.next();
         }
     }
     // The other draw took no part in the search, so its errors are not biased by it.
-    let (before, after) = (
-        search.errors([0.0; 2], &draws[1], ITERATIONS.1)?,
-        search.errors(best, &draws[1], ITERATIONS.1)?,
-    );
+    let unmoved = Correction { shift: [0.0; 2], ..best };
+    let (before, after) =
+        (search.errors(unmoved, 1, ITERATIONS.1)?, search.errors(best, 1, ITERATIONS.1)?);
     let (Some(before), Some(after)) = (before, after) else { return Ok(None) };
-    let norm = draws[1].norm(search.y.view());
-    let length = best[0].hypot(best[1]);
-    let converged = has_settled && best.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
-    let is_explained =
-        after.iter().sum::<f64>() < EXPLAINED * draws[1].neighbour_error(search.y.view());
+    let norm = search.draws[1].norm(search.y.view());
+    let length = best.shift[0].hypot(best.shift[1]);
+    let converged = has_settled && best.shift.iter().all(|shift| shift.abs() <= REACH as f64 + 0.5);
+    let Some(wrong) = search.errors(best.elsewhere(), 1, ITERATIONS.1)? else { return Ok(None) };
+    let is_explained = after.iter().sum::<f64>() < EXPLAINED * wrong.iter().sum::<f64>();
     Ok(Some(Registration {
-        shift: best,
+        correction: best,
         uncertainty,
         error_before: before.iter().sum::<f64>() / norm,
         error_after: after.iter().sum::<f64>() / norm,
@@ -147,6 +187,19 @@ pub fn register(
             && t_statistic(&before, &after) >= SIGNIFICANT,
         converged: converged && is_explained,
     }))
+}
+
+/// Chooses the interpolation of masks that have moved by a known `shift`, from a piece as for [`register`].
+///
+/// # Errors
+/// Those of [`register`].
+pub fn interpolation(
+    masks: ArrayView3<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    shift: [f64; 2],
+    proceed: &mut dyn FnMut(f64) -> bool,
+) -> Result<Interpolation> {
+    Search::new(masks, y, proceed)?.interpolation(shift)
 }
 
 /// Draws two sets of hold-out pixels of a measurement \[1,h,w\]. No pixel is in both.
@@ -165,9 +218,12 @@ fn draw(y: &Array3<f32>) -> [HoldOut; 2] {
 struct Search<'a> {
     /// Masks \[B,h,w\] of the piece with its margin.
     masks: Array3<f32>,
-    interpolated: Interpolated,
+    /// The masks by each of [`Interpolation::ALL`].
+    interpolated: [Interpolated; 3],
     /// Measurement \[1,h,w\] of the piece without its margin.
     y: Array3<f32>,
+    /// Hold-out pixels of the search, and of the decision.
+    draws: [HoldOut; 2],
     proceed: &'a mut dyn FnMut(f64) -> bool,
     /// Finished iterations.
     done: f64,
@@ -182,14 +238,38 @@ struct Fit {
     has_settled: bool,
 }
 
-impl Search<'_> {
-    /// Squared hold-out errors with masks that are moved by `shift`; `None` if the masks are dark or the solver diverges.
+impl<'a> Search<'a> {
+    fn new(
+        masks: ArrayView3<'_, f32>,
+        y: ArrayView2<'_, f32>,
+        proceed: &'a mut dyn FnMut(f64) -> bool,
+    ) -> Result<Self> {
+        let (_, height, width) = masks.dim();
+        if y.dim() != (height, width) || height.min(width) < SHORTEST_SIDE + 2 * MARGIN {
+            return Err(ReconError::Shape {
+                what: "the piece of a registration",
+                found: format!("{} and {}", shape_text(masks.shape()), shape_text(y.shape())),
+                expected: format!("one size of at least {} pixels", SHORTEST_SIDE + 2 * MARGIN),
+            });
+        }
+        let inner = s![MARGIN..height - MARGIN, MARGIN..width - MARGIN];
+        let interpolated = Interpolation::ALL.map(|kind| Interpolated::new(masks, kind));
+        let masks = masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask });
+        let y = y.slice(inner).insert_axis(Axis(0)).to_owned();
+        let draws = draw(&y);
+        let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
+        let total = ((2 * REACH + 1).pow(2) * ITERATIONS.0 + runs * ITERATIONS.1) as f64;
+        Ok(Self { masks, interpolated, y, draws, proceed, done: 0.0, total })
+    }
+
+    /// Squared errors at the pixels of a draw with moved masks; `None` if they are dark or the solver diverges.
     fn errors(
         &mut self,
-        shift: [f64; 2],
-        hold_out: &HoldOut,
+        Correction { shift, interpolation }: Correction,
+        draw: usize,
         iterations: usize,
     ) -> Result<Option<Vec<f64>>> {
+        let hold_out = &self.draws[draw];
         if !(self.proceed)((self.done / self.total).min(1.0)) {
             return Err(ReconError::Cancelled);
         }
@@ -202,7 +282,7 @@ impl Search<'_> {
             let (row, column) = (start(0), start(1));
             self.masks.slice(s![.., row..row + rows, column..column + columns]).to_owned()
         } else {
-            self.interpolated.window(shift, inner.0, inner.1)
+            self.interpolated[interpolation as usize].window(shift, inner.0, inner.1)
         };
         let whole = match SensingOperator::new(masks) {
             Err(ReconError::DarkMasks { .. }) => return Ok(None),
@@ -217,31 +297,52 @@ impl Search<'_> {
     }
 
     /// The shift by whole pixels with the smallest error.
-    fn whole_pixels(&mut self, hold_out: &HoldOut) -> Result<Option<[f64; 2]>> {
+    fn whole_pixels(&mut self) -> Result<Option<Correction>> {
         let reach = REACH as i32;
-        let mut best: Option<(f64, [f64; 2])> = None;
+        let mut best: Option<(f64, Correction)> = None;
         for row in -reach..=reach {
             for column in -reach..=reach {
                 let shift = [f64::from(row), f64::from(column)];
-                let Some(errors) = self.errors(shift, hold_out, ITERATIONS.0)? else { continue };
+                let place = Correction { shift, interpolation: Interpolation::default() };
+                let Some(errors) = self.errors(place, 0, ITERATIONS.0)? else { continue };
                 let error: f64 = errors.iter().sum();
                 if best.is_none_or(|(smallest, _)| error < smallest) {
-                    best = Some((error, shift));
+                    best = Some((error, place));
                 }
             }
         }
-        Ok(best.map(|(_, shift)| shift))
+        Ok(best.map(|(_, place)| place))
+    }
+
+    /// The interpolation with the smallest error relative to that of the same masks elsewhere, since a loss of contrast lowers
+    /// both. Shifts by whole pixels have the default: none is better there.
+    fn interpolation(&mut self, shift: [f64; 2]) -> Result<Interpolation> {
+        let mut best = (f64::INFINITY, Interpolation::default());
+        if shift.iter().all(|shift| shift.fract() == 0.0) {
+            return Ok(best.1);
+        }
+        for interpolation in Interpolation::ALL {
+            let place = Correction { shift, interpolation };
+            let Some(errors) = self.errors(place, 0, ITERATIONS.1)? else { continue };
+            let Some(wrong) = self.errors(place.elsewhere(), 0, ITERATIONS.1)? else { continue };
+            let ratio = errors.iter().sum::<f64>() / wrong.iter().sum::<f64>();
+            if ratio < best.0 {
+                best = (ratio, interpolation);
+            }
+        }
+        Ok(best.1)
     }
 
     /// Fits a quadratic to the errors on a grid of 3x3 shifts around `centre`. The minimum lies within the grid.
-    fn refine(&mut self, centre: [f64; 2], step: f64, hold_out: &HoldOut) -> Result<Option<Fit>> {
+    fn refine(&mut self, best: Correction, step: f64) -> Result<Option<Fit>> {
+        let centre = best.shift;
         let mut grid = Vec::with_capacity(9);
         for place in 0..9 {
             let (row, column) = (f64::from(place / 3 - 1), f64::from(place % 3 - 1));
             let limit = (REACH + 1) as f64;
             let shift = [centre[0] + step * row, centre[1] + step * column];
             let shift = shift.map(|value| value.clamp(-limit, limit));
-            match self.errors(shift, hold_out, ITERATIONS.1)? {
+            match self.errors(Correction { shift, ..best }, 0, ITERATIONS.1)? {
                 Some(errors) => grid.push(errors),
                 None => return Ok(None),
             }
@@ -321,19 +422,10 @@ impl Quadratic {
     }
 }
 
-/// Interpolation of masks.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Kernel {
-    /// Linear, for binary masks: a moved pixel then covers parts of its neighbours in proportion to their areas.
-    Area,
-    /// Cubic splines, for masks with intermediate values, which optics have blurred.
-    Spline,
-}
-
 /// Interpolated masks \[B,h,w\].
 pub struct Interpolated {
-    kernel: Kernel,
-    /// The masks, or coefficients of splines through them \[B,h,w\].
+    degree: usize,
+    /// Coefficients of splines through the masks \[B,h,w\].
     coefficients: Array3<f32>,
     /// `sum C^2` of the masks \[h,w\]; NaN where they are unknown.
     energy: Array2<f32>,
@@ -341,17 +433,17 @@ pub struct Interpolated {
 
 impl Interpolated {
     /// Continues the masks by reflection. NaN are filled from their surroundings, so that they do not ring.
-    pub fn new(masks: ArrayView3<'_, f32>) -> Self {
+    pub fn new(masks: ArrayView3<'_, f32>, interpolation: Interpolation) -> Self {
         let energy = masks.map_axis(Axis(0), |pixel| pixel.iter().map(|mask| mask * mask).sum());
         let mut coefficients = masks.to_owned();
         coefficients.outer_iter_mut().for_each(fill);
-        let kernel = if is_binary(masks) { Kernel::Area } else { Kernel::Spline };
-        if kernel == Kernel::Spline {
-            for axis in [Axis(1), Axis(2)] {
-                coefficients.lanes_mut(axis).into_iter().for_each(filter);
+        let (poles, gain) = interpolation.filter();
+        for axis in [Axis(1), Axis(2)] {
+            for lane in coefficients.lanes_mut(axis) {
+                filter(lane, &poles, gain);
             }
         }
-        Self { kernel, coefficients, energy }
+        Self { degree: interpolation.degree(), coefficients, energy }
     }
 
     /// A window of the masks after they moved down and to the right by `shift`, clipped to \[0,1\]. A pixel that no part of
@@ -364,7 +456,7 @@ impl Interpolated {
     ) -> Array3<f32> {
         let (frames, height, width) = self.coefficients.dim();
         let taps = |range: Range<usize>, shift: f64, length: usize| -> Vec<Taps> {
-            range.map(|place| Taps::at(place, shift, length, self.kernel)).collect()
+            range.map(|place| Taps::at(place, shift, length, self.degree)).collect()
         };
         let (rows, columns) = (taps(rows, shift[0], height), taps(columns, shift[1], width));
         let mut window = Array3::zeros((frames, rows.len(), columns.len()));
@@ -404,16 +496,6 @@ impl Interpolated {
     }
 }
 
-/// True if nearly all known values are close to 0 or 1.
-fn is_binary(masks: ArrayView3<'_, f32>) -> bool {
-    let (mut known, mut between) = (0, 0);
-    for &value in masks.iter().filter(|value| !value.is_nan()) {
-        known += 1;
-        between += usize::from(value > INTERMEDIATE && value < 1.0 - INTERMEDIATE);
-    }
-    f64::from(between as u32) <= MAX_INTERMEDIATE * f64::from(known as u32)
-}
-
 /// Replaces NaN of a mask within [`FILLED`] pixels of known ones by means of their neighbours, and others by 0.
 fn fill(mut mask: ArrayViewMut2<'_, f32>) {
     let mut unknown: Vec<(usize, usize)> =
@@ -442,88 +524,94 @@ pub fn covers(place: usize, shift: f64, length: usize) -> bool {
 
 /// The coefficients that contribute to a place, and their weights.
 struct Taps {
-    places: [usize; 4],
-    weights: [f32; 4],
+    places: Vec<usize>,
+    weights: Vec<f32>,
     is_between: bool,
 }
 
 impl Taps {
     /// The one or two nearest pixels.
     fn nearest(&self) -> &[usize] {
-        if self.is_between { &self.places[1..3] } else { &self.places[1..2] }
+        let middle = self.places.len() / 2 - 1;
+        &self.places[middle..=middle + usize::from(self.is_between)]
     }
 
-    fn at(place: usize, shift: f64, length: usize, kernel: Kernel) -> Self {
+    fn at(place: usize, shift: f64, length: usize, degree: usize) -> Self {
         let is_known = covers(place, shift, length);
         let place = place as f64 - shift;
-        let (first, t) = (place.floor() as i64 - 1, place - place.floor());
-        let s = 1.0 - t;
-        let weights = match kernel {
-            Kernel::Area => [0.0, s, t, 0.0],
-            Kernel::Spline => [
-                s.powi(3) / 6.0,
-                2.0 / 3.0 - t * t * (2.0 - t) / 2.0,
-                2.0 / 3.0 - s * s * (2.0 - s) / 2.0,
-                t.powi(3) / 6.0,
-            ],
-        };
+        let (first, t) = (place.floor() as i64 - (degree / 2) as i64, place - place.floor());
+        // The B-splines of each degree follow from those of the degree below (de Boor).
+        let mut weights = vec![1.0];
+        for degree in 1..=degree {
+            let below = |tap: usize| weights.get(tap).copied().unwrap_or(0.0);
+            let weight = |tap: usize| {
+                let rising = if tap > 0 { below(tap - 1) } else { 0.0 };
+                let at = t - tap as f64;
+                ((at + degree as f64) * rising + (1.0 - at) * below(tap)) / degree as f64
+            };
+            weights = (0..=degree).map(weight).collect();
+        }
         let reflected = |index: i64| {
             let last = length as i64 - 1;
             let index = index.abs();
             (if index > last { 2 * last - index } else { index }).clamp(0, last) as usize
         };
+        let known = |weight: f64| if is_known { weight as f32 } else { f32::NAN };
         Self {
-            places: [0, 1, 2, 3].map(|tap| reflected(first + tap)),
-            weights: weights.map(|weight| if is_known { weight as f32 } else { f32::NAN }),
+            places: (first..=first + degree as i64).map(reflected).collect(),
+            weights: weights.into_iter().map(known).collect(),
             is_between: t > 0.0,
         }
     }
 }
 
-/// Converts samples into coefficients of a cubic spline, in place (Unser 1999).
-fn filter(mut line: ArrayViewMut1<'_, f32>) {
+/// Converts samples into coefficients of a spline, in place (Unser 1999).
+fn filter(mut line: ArrayViewMut1<'_, f32>, poles: &[f64], gain: f64) {
     let length = line.len();
     if length < 2 {
         return;
     }
-    let pole = 3.0f64.sqrt() - 2.0;
-    let mut values: Vec<f64> = line.iter().map(|&value| 6.0 * f64::from(value)).collect();
-    // Beyond 30 samples the powers of the pole are below 1e-17.
-    let (mut sum, mut power) = (0.0, 1.0);
-    for index in 0..30 {
-        let period = 2 * (length - 1);
-        let place = index % period;
-        sum += power * values[if place < length { place } else { period - place }];
-        power *= pole;
-    }
-    values[0] = sum;
-    for index in 1..length {
-        values[index] += pole * values[index - 1];
-    }
-    let last = length - 1;
-    values[last] = pole / (pole * pole - 1.0) * (values[last] + pole * values[last - 1]);
-    for index in (0..last).rev() {
-        values[index] = pole * (values[index + 1] - values[index]);
+    let mut values: Vec<f64> = line.iter().map(|&value| gain * f64::from(value)).collect();
+    for pole in poles {
+        // Beyond 30 samples the powers of the pole are below 2e-11.
+        let (mut sum, mut power) = (0.0, 1.0);
+        for index in 0..30 {
+            let period = 2 * (length - 1);
+            let place = index % period;
+            sum += power * values[if place < length { place } else { period - place }];
+            power *= pole;
+        }
+        values[0] = sum;
+        for index in 1..length {
+            values[index] += pole * values[index - 1];
+        }
+        let last = length - 1;
+        values[last] = pole / (pole * pole - 1.0) * (values[last] + pole * values[last - 1]);
+        for index in (0..last).rev() {
+            values[index] = pole * (values[index + 1] - values[index]);
+        }
     }
     line.iter_mut().zip(values).for_each(|(out, value)| *out = value as f32);
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Interpolated, MARGIN, Registration, choose, register};
+    use super::{Interpolated, Interpolation, MARGIN, Registration, choose, register};
     use ndarray::{Array3, ArrayView3, Axis, s};
-    use optics::{iid_masks, measure, noisy};
+    use optics::{iid_masks, measure, noisy, soften};
 
-    /// Masks \[B,n,n\] of a finer pattern, as areas of its pixels, moved by `cells` quarters of a pixel.
-    fn by_areas(frames: usize, side: usize, cells: [usize; 2]) -> Array3<f32> {
-        let fine = iid_masks(frames, side + 8, side + 8, 3).unwrap();
+    /// Grey masks \[B,n,n\] as means over the areas of pixels, after their light moved by `cells` quarters of a pixel.
+    fn by_areas(frames: usize, side: usize, cells: [usize; 2], blur: f64) -> Array3<f32> {
+        // Two apertures show the pattern at places that are a pixel apart.
+        let pattern = iid_masks(frames, side + 8, side + 9, 3).unwrap();
+        let size = (frames, 4 * side + 32, 4 * side + 32);
+        let mut light = Array3::from_shape_fn(size, |(k, i, j)| {
+            (pattern[[k, i / 4, j / 4]] + pattern[[k, i / 4, j / 4 + 1]]) / 2.0
+        });
+        soften(&mut light, 4.0 * blur, 0.0).unwrap();
         Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
-            let area = (0..16).map(|cell| {
-                let row = 4 * i + 16 + cell / 4 - cells[0];
-                let column = 4 * j + 16 + cell % 4 - cells[1];
-                fine[[k, row / 4, column / 4]]
-            });
-            area.sum::<f32>() / 16.0
+            let (row, column) = (4 * i + 16 - cells[0], 4 * j + 16 - cells[1]);
+            light.slice(s![k, row..row + 4, column..column + 4]).mean().unwrap()
         })
     }
 
@@ -552,16 +640,21 @@ mod tests {
     #[test]
     fn moved_masks_are_found_and_masks_that_fit_are_left() {
         let side = 2 * MARGIN + 64;
-        let calibrated = by_areas(6, side, [0, 0]);
-        for (cells, sigma) in [([2, 1], 0.0), ([10, 3], 0.01)] {
-            let moved = by_areas(6, side, cells);
-            let expected = cells.map(|cell| cell as f64 / 4.0);
-            let found = registered(&calibrated, moved.view(), sigma);
+        for (cells, blur, sigma, interpolation) in [
+            ([2, 1], 0.0, 0.0, Interpolation::Linear),
+            ([10, 3], 0.0, 0.01, Interpolation::Linear),
+            ([2, 3], 0.7, 0.0, Interpolation::Quintic),
+        ] {
+            let calibrated = by_areas(6, side, [0, 0], blur);
+            let found = registered(&calibrated, by_areas(6, side, cells, blur).view(), sigma);
             assert!(found.applied && found.error_after < found.error_before, "{found:?}");
-            for (axis, expected) in expected.into_iter().enumerate() {
-                assert!((found.shift[axis] - expected).abs() < 0.1, "{cells:?} {found:?}");
+            assert_eq!(found.correction.interpolation, interpolation, "{found:?}");
+            for (axis, cells) in cells.into_iter().enumerate() {
+                let expected = cells as f64 / 4.0;
+                assert!((found.correction.shift[axis] - expected).abs() < 0.03, "{found:?}");
             }
         }
+        let calibrated = by_areas(6, side, [0, 0], 0.0);
         let mut flipped = calibrated.clone();
         flipped.invert_axis(Axis(2));
         let found = registered(&flipped, calibrated.view(), 0.01);
@@ -575,10 +668,11 @@ mod tests {
     #[test]
     fn dark_and_unknown_pixels_count_as_not_measured() {
         let mut masks = iid_masks(4, 60, 60, 4).unwrap();
-        let whole = Interpolated::new(masks.view());
+        let whole = Interpolated::new(masks.view(), Interpolation::Linear);
         masks.slice_mut(s![.., 30, 30]).fill(f32::NAN);
         let shift = [0.4, 0.3];
-        let moved = Interpolated::new(masks.view()).window(shift, 20..40, 20..40);
+        let interpolated = Interpolated::new(masks.view(), Interpolation::Linear);
+        let moved = interpolated.window(shift, 20..40, 20..40);
         assert!(moved.iter().all(|value| (0.0..=1.0).contains(value)));
         let darkest = |masks: &Array3<f32>| {
             let energies =
@@ -611,22 +705,24 @@ mod tests {
 
     #[test]
     fn interpolation_passes_through_the_masks_and_a_window_needs_only_its_margin() {
-        let binary = iid_masks(2, 80, 90, 4).unwrap();
-        let grey = by_areas(2, 90, [1, 2]).slice_move(s![.., ..80, ..]);
-        for masks in [binary, grey] {
-            check_interpolation(&masks);
+        let masks = iid_masks(2, 80, 90, 4).unwrap();
+        for interpolation in Interpolation::ALL {
+            check_interpolation(&masks, interpolation);
         }
     }
 
-    fn check_interpolation(masks: &Array3<f32>) {
-        let whole = Interpolated::new(masks.view());
+    fn check_interpolation(masks: &Array3<f32>, interpolation: Interpolation) {
+        let whole = Interpolated::new(masks.view(), interpolation);
         let unmoved = whole.window([0.0; 2], 0..80, 0..90);
         assert!(unmoved.iter().zip(masks).all(|(one, other)| (one - other).abs() < 1e-5));
         let shift = [1.3, -2.6];
         let expected = whole.window(shift, 30..50, 30..60);
         let piece = masks.slice(s![.., 30 - MARGIN..50 + MARGIN, 30 - MARGIN..60 + MARGIN]);
-        let found =
-            Interpolated::new(piece).window(shift, MARGIN..MARGIN + 20, MARGIN..MARGIN + 30);
+        let found = Interpolated::new(piece, interpolation).window(
+            shift,
+            MARGIN..MARGIN + 20,
+            MARGIN..MARGIN + 30,
+        );
         assert!(found.iter().zip(&expected).all(|(one, other)| (one - other).abs() < 1e-5));
         let moved = whole.window([3.0, 0.0], 0..80, 0..90);
         assert!(moved.slice(s![.., ..2, ..]).iter().all(|value| value.is_nan()));

@@ -14,10 +14,11 @@ use engine::intake::{
     self, Behind, Exposure, IntakeError, Refusal, RefusalCode, Source, expected_size, plan,
 };
 use engine::job::{
-    CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Sequence, Sha256,
-    Submission, TaskStage, keeps_mosaic,
+    CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Registered, Sequence,
+    Sha256, Submission, TaskStage, keeps_mosaic,
 };
 use engine::pipeline::progress::Monitor;
+use engine::pipeline::registration;
 use formats::mat::SceneArray;
 use formats::{FormatError, Limits, Part, StackInfo, StackWriter, planar};
 use store::{
@@ -79,9 +80,11 @@ pub(super) fn check(
     let running = Running { check, monitor, deadline: Instant::now() + time };
     let calibration = check.task.calibration.as_ref();
     let checked = match (&check.task.request.submission, calibration) {
-        (Submission::Calibration(request), _) => match &request.captures {
-            Some(captures) => running.captures(captures, request),
-            None => running.masks(request),
+        (Submission::Calibration(request), _) => match (&request.captures, request.registration_of)
+        {
+            (Some(captures), _) => running.captures(captures, request),
+            (None, Some(_)) => running.corrected(),
+            (None, None) => running.masks(request),
         },
         (Submission::Measurement(request), Some(masks)) => running.measurement(request, masks),
         (Submission::Model(request), Some(masks)) => running.model(request, masks, command),
@@ -218,6 +221,48 @@ impl Running<'_> {
             dispersion,
         };
         Ok(Checked::Masks(facts, writer.finish()?.finish()?))
+    }
+
+    /// Writes masks as the registration of a job has corrected them.
+    fn corrected(&self) -> Result<Checked> {
+        let task = &self.check.task;
+        let correction = task.registered.as_ref().and_then(Registered::correction);
+        let (Some(calibration), Some(correction)) = (&task.calibration, correction) else {
+            let detail = "the job has been deleted";
+            let refusal = Refusal::new(RefusalCode::InvalidRequest, detail);
+            return Err(refusal.at("/registration_of").into());
+        };
+        let stored = self.upload(calibration.prepared, "/registration_of")?;
+        let stored = planar::Reader::open(&stored, &Limits::default())?;
+        let info = *stored.info();
+        // Two copies: in bands, and whole.
+        self.reserve(planar::bytes(&info), 2)?;
+        let scratch = self.check.store.staged_path()?;
+        let writer = self.check.store.blob_writer()?;
+        let mut writer = planar::writer(writer, info.frames, info.height, info.width)?;
+        let statistics =
+            registration::correct(&stored, correction, scratch.path(), |share, mask| {
+                self.proceed(share)?;
+                mask.map_or(Ok(()), |mask| writer.write_frame(mask))
+            })?;
+        let masks = writer.finish()?.finish()?;
+        let facts = NewCalibration {
+            masks: masks.sha256(),
+            format: "registration".into(),
+            sample: info.sample.to_string(),
+            axes: None,
+            frames: info.frames,
+            height: info.height,
+            width: info.width,
+            full_scale: 1.0,
+            mask_mean: statistics.mean,
+            dead_pixels: statistics.dead_pixels,
+            clipped_negatives: 0,
+            mosaic: None,
+            reading: None,
+            dispersion: None,
+        };
+        Ok(Checked::Masks(facts, masks))
     }
 
     /// Subtracts the dark from a measurement, divides by its full scale, and checks it against the masks of its

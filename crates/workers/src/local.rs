@@ -24,6 +24,7 @@ use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::records::{PilotRecord, PreparedRecord, WhiteRecord};
 use engine::pipeline::tile::TileInput;
 use formats::planar;
+use reconstruction::registration::Correction;
 use store::{
     Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, MovieWork, Product, StagedBlob,
     Store, StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
@@ -52,9 +53,9 @@ impl Local {
         Self { store, worker, claimant, device, watcher: Arc::default() }
     }
 
-    fn arrays(&self, masks: Sha256, snapshots: Sha256, shift: Option<[f64; 2]>) -> Arrays {
+    fn arrays(&self, masks: Sha256, snapshots: Sha256, correction: Option<Correction>) -> Arrays {
         let [masks, snapshots] = [masks, snapshots].map(|sha256| (self.path(sha256), sha256));
-        Arrays { masks, snapshots, shift }
+        Arrays { masks, snapshots, correction }
     }
 
     /// Collects everything that a task needs.
@@ -88,13 +89,13 @@ impl Local {
 
     fn step(&self, task: &JobTask, kind: TaskKind, attempt: u32) -> Result<TaskInput, TaskError> {
         let JobTask { job, spec, calibration, measurement, .. } = task;
-        let shift = shift(task.prepared.as_ref())?;
-        let arrays = self.arrays(calibration.prepared, measurement.prepared, shift);
+        let correction = correction(task.prepared.as_ref())?;
+        let arrays = self.arrays(calibration.prepared, measurement.prepared, correction);
         let folder = || self.store.staged_dir().map_err(failed);
         Ok(match kind {
             TaskKind::Prepare => TaskInput::Prepare {
                 // The calibrated masks are registered, also in a second attempt.
-                arrays: Arrays { shift: None, ..arrays },
+                arrays: Arrays { correction: None, ..arrays },
                 snapshots: spec.snapshots,
                 registration: spec.registration,
                 is_coloured: spec.shape.mosaic.is_some() || spec.dispersion.is_some(),
@@ -269,7 +270,7 @@ impl Transport for Local {
     }
 
     fn window(&self, task: &TileTask) -> Result<TileInput, PipelineError> {
-        let arrays = self.arrays(task.masks, task.measurement, task.shift);
+        let arrays = self.arrays(task.masks, task.measurement, task.correction);
         let input = arrays.window(task.snapshots.clone(), &task.tile.window(), task.white)?;
         Ok(TileInput { pieces: task.pieces.clone(), ..input })
     }
@@ -299,9 +300,9 @@ fn registered(prepared: Option<&Value>) -> Result<Option<Registered>, PipelineEr
     Ok(parsed::<Option<PreparedRecord>>("prepare task", prepared)?.and_then(|it| it.registration))
 }
 
-/// The shift of the masks, if they are corrected.
-fn shift(prepared: Option<&Value>) -> Result<Option<[f64; 2]>, PipelineError> {
-    Ok(registered(prepared)?.and_then(|registered| registered.applied_shift()))
+/// The correction of the masks, if they have moved.
+fn correction(prepared: Option<&Value>) -> Result<Option<Correction>, PipelineError> {
+    Ok(registered(prepared)?.and_then(|registered| registered.correction()))
 }
 
 /// The solver's scale, as the prepare task recorded it.
@@ -365,7 +366,7 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
         pieces.into_iter().filter(|piece| piece.run == run).map(|piece| piece.snapshots);
     Ok(TileTask {
         masks: task.calibration.prepared,
-        shift: shift(task.prepared.as_ref())?,
+        correction: correction(task.prepared.as_ref())?,
         measurement: task.measurement.prepared,
         snapshots: first..first + runs.runs()[run].len() as u32,
         pieces: run_pieces.map(|piece| piece.start - start..piece.end - start).collect(),

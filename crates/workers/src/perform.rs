@@ -10,7 +10,7 @@ use super::check::check;
 use super::model_process::ModelProcesses;
 use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, TransportError};
 use engine::intake::{self, Calibrated, IntakeError, Report, calibrate};
-use engine::job::{Assessment, Sha256, SnapshotRange, TaskProgress, TaskStage};
+use engine::job::{Assessment, Registered, Sha256, SnapshotRange, TaskProgress, TaskStage};
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::assessment::TileAssessment;
@@ -51,10 +51,16 @@ pub(super) fn perform(
     let (record, output) = match input {
         TaskInput::Prepare { arrays, snapshots, registration, is_coloured } => {
             arrays.verify()?;
-            let white = scale::job_white_level(&arrays, snapshots, monitor)?;
+            let mut white = scale::job_white_level(&arrays, snapshots, monitor)?;
             let job = (&arrays, snapshots);
             let registration =
                 registration::register_stored(job, (registration, is_coloured), white, monitor)?;
+            let correction = registration.as_ref().and_then(Registered::correction);
+            if correction.is_some() {
+                // Behind masks elsewhere, pixels that seem dark have light, and the scene seems too bright.
+                let arrays = Arrays { correction, ..arrays };
+                white = scale::job_white_level(&arrays, snapshots, monitor)?;
+            }
             monitor.reach(TaskStage::Reading, 1.0);
             (json(&PreparedRecord { white, registration })?, Output::Record)
         }

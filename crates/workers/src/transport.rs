@@ -26,6 +26,7 @@ use engine::pipeline::tile::TileInput;
 use formats::{DiskTrouble, FormatError};
 use reconstruction::ReconError;
 use reconstruction::assessment::Evidence;
+use reconstruction::registration::Correction;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::Tile;
 use store::{
@@ -191,9 +192,9 @@ pub struct Check {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TileTask {
     pub masks: Sha256,
-    /// Pixels by which the masks have moved down and to the right.
+    /// Correction of masks that have moved.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub shift: Option<[f64; 2]>,
+    pub correction: Option<Correction>,
     pub measurement: Sha256,
     /// The run of snapshots that the tile belongs to, as indices in the measurement.
     pub snapshots: Range<u32>,

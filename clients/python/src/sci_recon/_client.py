@@ -513,6 +513,14 @@ class Job(Entity):
             raise JobFailed(self.record)
         return self
 
+    def corrected_calibration(self, name: str | None = None) -> Calibration:
+        """Creates a calibration from the masks of this job, which its registration has moved.
+
+        Raises `ApiError` if the job has not succeeded, or if its masks were not moved.
+        """
+        record = self.client._create("calibrations", registration_of=self.id, name=name)
+        return Calibration(self.client, record).ready()
+
     def cancel(self) -> Job:
         """Cancels the job. Running tasks stop after their current iteration."""
         self.record = transfer.send(self.client.http, "POST", f"/v1/jobs/{self.id}/cancel").json()

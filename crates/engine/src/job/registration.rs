@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::report::{Finding, FindingCode};
 use super::text::InvalidField;
-use reconstruction::registration::{REACH, Registration};
+use reconstruction::registration::{Correction, Interpolation, REACH, Registration};
 
 /// Reason where an estimate is not reliable.
 const NOT_CONVERGED: &str = "no shift by at most 4 pixels makes the masks explain the measurement well enough, so they were not moved";
@@ -56,6 +56,8 @@ impl RegistrationRequest {
 pub struct Registered {
     /// Pixels by which the masks have moved down and to the right. Zeros if nothing was estimated.
     pub shift: [f64; 2],
+    /// How the moved masks are interpolated: so that the hold-out error is smallest.
+    pub interpolation: Interpolation,
     /// Standard error of each; null for a stated shift.
     pub uncertainty: Option<[f64; 2]>,
     /// Relative squared error at hold-out pixels with the calibrated masks; null for a stated shift.
@@ -73,15 +75,16 @@ pub struct Registered {
 
 impl Registered {
     /// The outcome of a shift that the request states.
-    pub fn stated(shift: [f64; 2]) -> Self {
+    pub fn stated(Correction { shift, interpolation }: Correction) -> Self {
         let applied = shift != [0.0; 2];
-        Self { shift, applied, ..Self::skipped("the shift was stated") }
+        Self { shift, interpolation, applied, ..Self::skipped("the shift was stated") }
     }
 
     /// The outcome where nothing was estimated.
     pub fn skipped(reason: &str) -> Self {
         Self {
             shift: [0.0; 2],
+            interpolation: Interpolation::default(),
             uncertainty: None,
             error_before: None,
             error_after: None,
@@ -91,9 +94,10 @@ impl Registered {
         }
     }
 
-    /// The shift that is applied to the masks.
-    pub fn applied_shift(&self) -> Option<[f64; 2]> {
-        self.applied.then_some(self.shift)
+    /// The correction that is applied to the masks.
+    pub fn correction(&self) -> Option<Correction> {
+        let Self { shift, interpolation, applied, .. } = *self;
+        applied.then_some(Correction { shift, interpolation })
     }
 
     /// Findings of the measurement's check that do not apply to masks that the job has moved. If these still do not fit, the
@@ -111,7 +115,9 @@ impl Registered {
 
     /// The findings on masks that the job has moved.
     pub fn findings(&self) -> Vec<Finding> {
-        let Some([rows, columns]) = self.applied_shift() else { return Vec::new() };
+        let Some(Correction { shift: [rows, columns], .. }) = self.correction() else {
+            return Vec::new();
+        };
         let detail = match (self.error_before, self.error_after) {
             (Some(before), Some(after)) => format!(
                 "the masks have moved by ({rows:.2}, {columns:.2}) pixels (rows, columns) since the calibration; the \
@@ -138,10 +144,17 @@ impl Registered {
 
 impl From<Registration> for Registered {
     fn from(found: Registration) -> Self {
-        let Registration { shift, uncertainty, error_before, error_after, applied, converged } =
-            found;
+        let Registration {
+            correction: Correction { shift, interpolation },
+            uncertainty,
+            error_before,
+            error_after,
+            applied,
+            converged,
+        } = found;
         Self {
             shift,
+            interpolation,
             uncertainty: Some(uncertainty),
             error_before: Some(error_before),
             error_after: Some(error_after),

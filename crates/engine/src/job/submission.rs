@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use super::captures::MAX_REPEATS;
 use super::reading::keeps_mosaic;
-use super::{CalibrationId, Captures, Dispersion, InvalidField, Label, Mosaic, Sequence, Sha256};
+use super::{
+    CalibrationId, Captures, Dispersion, InvalidField, JobId, Label, Mosaic, Sequence, Sha256,
+};
 use formats::{Axes, Crop, FullScale, Packing};
 
 /// CPU-seconds that a check takes for each byte of its uploads (measured with 8-bit masks), and at least.
@@ -21,10 +23,10 @@ const EXPOSURE_TOLERANCE: f64 = 1e-3;
 /// CPU-seconds of loading a small network and running it once.
 const MODEL_S: f64 = 1.0;
 
-/// The body of `POST /v1/calibrations`: masks, or the captures from which they are made.
+/// The body of `POST /v1/calibrations`: masks, the captures from which they are made, or a job that has corrected them.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
-#[schemars(extend("anyOf" = [{ "required": ["masks"] }, { "required": ["captures"] }]))]
+#[schemars(extend("anyOf" = [{ "required": ["masks"] }, { "required": ["captures"] }, { "required": ["registration_of"] }]))]
 pub struct CalibrationRequest {
     pub name: Option<Label>,
     pub masks: Option<Sha256>,
@@ -49,6 +51,9 @@ pub struct CalibrationRequest {
     #[schemars(range(min = 1.2e-38, max = 3.4e38))]
     pub full_scale: Option<f32>,
     pub captures: Option<Captures>,
+    /// A job whose registration has corrected its masks. These become the calibration.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub registration_of: Option<JobId>,
     /// Colours of the sensor's pixels; a grey sensor has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mosaic: Option<Mosaic>,
@@ -149,6 +154,14 @@ impl Submission {
         }
     }
 
+    /// The job that has corrected the masks of the calibration.
+    pub fn registration_of(&self) -> Option<JobId> {
+        match self {
+            Self::Calibration(request) => request.registration_of,
+            Self::Measurement(_) | Self::Model(_) => None,
+        }
+    }
+
     /// Each upload with its place in the request.
     pub fn uploads(&self) -> Vec<(String, Sha256)> {
         match self {
@@ -205,6 +218,17 @@ fn check_full_scale(full_scale: Option<f32>) -> Result<(), Vec<InvalidField>> {
 impl CalibrationRequest {
     fn check(&self) -> Result<(), Vec<InvalidField>> {
         let wrong = |pointer: &str, detail: &str| Err(vec![InvalidField::new(pointer, detail)]);
+        if self.registration_of.is_some() {
+            let (name, registration_of) = (self.name.clone(), self.registration_of);
+            return if *self == (Self { name, registration_of, ..Self::default() }) {
+                Ok(())
+            } else {
+                wrong(
+                    "/registration_of",
+                    "the masks come from the job: state no other field than the name",
+                )
+            };
+        }
         if let Some(dispersion) = &self.dispersion {
             if self.captures.is_some() {
                 return wrong(
@@ -249,7 +273,7 @@ impl CalibrationRequest {
                 Some((_, pointer, detail)) => wrong(pointer, detail),
                 None => captures.check(),
             },
-            _ => wrong("", "name either masks or captures, not both or none"),
+            _ => wrong("", "name either masks, captures or registration_of, one of them"),
         }
     }
 }

@@ -12,7 +12,7 @@ use super::tile::TileInput;
 use crate::job::Sha256;
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
-use reconstruction::registration::{Interpolated, MARGIN, covers};
+use reconstruction::registration::{Correction, Interpolated, MARGIN, covers};
 use reconstruction::tile::Window;
 
 /// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], divided by their full scale.
@@ -22,8 +22,8 @@ pub struct Arrays {
     pub masks: (PathBuf, Sha256),
     /// The file of the snapshots and its recorded hash.
     pub snapshots: (PathBuf, Sha256),
-    /// Pixels by which the masks have moved down and to the right since their calibration.
-    pub shift: Option<[f64; 2]>,
+    /// Correction of masks that have moved since their calibration.
+    pub correction: Option<Correction>,
 }
 
 impl Arrays {
@@ -43,16 +43,25 @@ impl Arrays {
         Reader::open(&self.masks.0, &Limits::default())
     }
 
-    /// The sum of all masks \[H,W\], in which pixels that were not measured count as 0. It reads one mask at a time.
+    /// The sum of all masks \[H,W\] after their correction, in which pixels that were not measured count as 0. It reads one
+    /// mask at a time, and moves their sum.
     pub fn light(&self, monitor: &Monitor) -> Result<Array2<f32>> {
+        let known = |mask: f32| if mask.is_nan() { 0.0 } else { mask };
         let masks = self.masks()?;
         let mut light = Array2::zeros((masks.info().height, masks.info().width));
         for frame in 0..masks.info().frames {
             monitor.check()?;
-            light +=
-                &plane(&masks, frame)?.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+            let mask = plane(&masks, frame)?;
+            light += &(if self.correction.is_some() { mask } else { mask.mapv_into(known) });
         }
-        Ok(light)
+        let Some(correction) = self.correction else { return Ok(light) };
+        // Moved masks are clipped to [0,1], so the sum is moved as a mean.
+        let frames = masks.info().frames as f32;
+        let mean = (light / frames).insert_axis(Axis(0));
+        let (_, height, width) = mean.dim();
+        let moved = Interpolated::new(mean.view(), correction.interpolation);
+        let moved = moved.window(correction.shift, 0..height, 0..width).remove_axis(Axis(0));
+        Ok(moved.mapv_into(|mean| frames * known(mean)))
     }
 
     /// One snapshot \[H,W\].
@@ -71,8 +80,8 @@ impl Arrays {
         let masks = self.masks()?;
         let frames = snapshots.start as usize..snapshots.end as usize;
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
-        let y = snapshot_window(&snapshots, frames, place, self.shift)?;
-        let masks = mask_window(&masks, place, self.shift)?;
+        let y = snapshot_window(&snapshots, frames, place, self.correction)?;
+        let masks = mask_window(&masks, place, self.correction)?;
         let masks = masks.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         let all_snapshots = 0..y.dim().0;
         Ok(TileInput { masks, y, white, pieces: vec![all_snapshots] })
@@ -88,24 +97,24 @@ pub fn window(
     reader.read_lattice(frames, (place.rows.clone(), place.columns.clone()), place.step)
 }
 
-/// Reads a window of all masks after they moved by `shift`. NaN are unknown. It depends on the masks within
+/// Reads a window of all masks after a correction. NaN are unknown. It depends on the masks within
 /// [`MARGIN`] pixels only.
 pub fn mask_window(
     masks: &Reader,
     place: &Window,
-    shift: Option<[f64; 2]>,
+    correction: Option<Correction>,
 ) -> Result<Array3<f32>, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
-    let Some(shift) = shift else { return window(masks, 0..frames, place) };
-    moved_window((height, width), place, shift, |wide| window(masks, 0..frames, wide))
+    let Some(correction) = correction else { return window(masks, 0..frames, place) };
+    moved_window((height, width), place, correction, |wide| window(masks, 0..frames, wide))
 }
 
-/// A window of masks of `height` x `width` pixels after they moved by `shift`. `read` gets the window of the calibrated masks
-/// on which it depends.
+/// A window of masks of `height` x `width` pixels after a correction. `read` gets the window of the calibrated masks on
+/// which it depends.
 pub(super) fn moved_window<E>(
     (height, width): (usize, usize),
     place: &Window,
-    shift: [f64; 2],
+    Correction { shift, interpolation }: Correction,
     read: impl FnOnce(&Window) -> Result<Array3<f32>, E>,
 ) -> Result<Array3<f32>, E> {
     let around = |range: &Range<usize>, length: usize| {
@@ -115,20 +124,21 @@ pub(super) fn moved_window<E>(
     let within = |range: &Range<usize>, start: usize| range.start - start..range.end - start;
     let inner = (within(&place.rows, rows.start), within(&place.columns, columns.start));
     let wide = Window { rows, columns, step: 1 };
-    let moved = Interpolated::new(read(&wide)?.view()).window(shift, inner.0, inner.1);
+    let masks = read(&wide)?;
+    let moved = Interpolated::new(masks.view(), interpolation).window(shift, inner.0, inner.1);
     let step = place.step.cast_signed();
     Ok(moved.slice(s![.., ..;step, ..;step]).to_owned())
 }
 
-/// Reads a window of snapshots. Pixels without a known mask after a shift are NaN, as if they were not measured.
+/// Reads a window of snapshots. Pixels without a known mask after a correction are NaN, as if they were not measured.
 pub fn snapshot_window(
     snapshots: &Reader,
     range: Range<usize>,
     place: &Window,
-    shift: Option<[f64; 2]>,
+    correction: Option<Correction>,
 ) -> Result<Array3<f32>, FormatError> {
     let mut y = window(snapshots, range, place)?;
-    let Some(shift) = shift else { return Ok(y) };
+    let Some(Correction { shift, .. }) = correction else { return Ok(y) };
     let (height, width) = (snapshots.info().height, snapshots.info().width);
     for ((_, row, column), value) in y.indexed_iter_mut() {
         let at = (place.rows.start + row * place.step, place.columns.start + column * place.step);

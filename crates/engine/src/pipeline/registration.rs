@@ -1,12 +1,19 @@
 //! Registration of the masks of a job, which is decided once before its other tasks.
 
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use super::arrays::{Arrays, mask_window, moved_window};
 use super::error::Result;
 use super::progress::Monitor;
 use crate::job::{Registered, RegistrationRequest, SnapshotRange, TaskStage};
-use reconstruction::registration;
+use formats::planar::{self, Reader};
+use formats::validate::MaskStatistics;
+use formats::{FormatError, Limits, StackInfo};
+use reconstruction::registration::{self, Correction, Interpolation};
 use reconstruction::tile::Window;
 
 /// Reason for sensors with colours. The planes of a mosaic sample the masks at every second pixel only.
@@ -14,6 +21,9 @@ const COLOUR: &str = "masks of colour sensors and spectral cameras are not regis
 const SMALL: &str = "the picture is too small to register the masks";
 const DARK: &str = "the piece on which masks are registered has no light or no measured pixels, or its reconstruction \
                     diverges";
+
+/// Height in rows of the bands in which stored masks are moved.
+const BAND: usize = 64;
 
 /// Side in pixels of the windows in which the light of moved masks is summed.
 const WINDOW: usize = 128;
@@ -30,37 +40,46 @@ pub fn register(
     masks: impl Fn(&Window) -> Result<Array3<f32>>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Option<Registered>> {
-    let mut outcome = match without_estimate(request, is_coloured) {
-        Some(outcome) => outcome,
-        None => Some(estimate(light()?.view(), y, &masks, proceed)?),
-    };
-    if let Some(registered) = &mut outcome
-        && let Some(shift) = registered.applied_shift()
-    {
-        registered.lost_light = Some(lost_light(y, shift, masks)?);
+    if let Some(outcome) = without_estimate(request, is_coloured) {
+        return Ok(outcome);
     }
-    Ok(outcome)
+    let mut registered = estimate(request, light()?.view(), y, &masks, proceed)?;
+    if let Some(correction) = registered.correction() {
+        registered.lost_light = Some(lost_light(y, correction, masks)?);
+    }
+    Ok(Some(registered))
 }
 
 fn estimate(
+    request: RegistrationRequest,
     light: ArrayView2<'_, f32>,
     y: ArrayView2<'_, f32>,
     masks: impl Fn(&Window) -> Result<Array3<f32>>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Registered> {
     let Some((rows, columns)) = registration::choose(light, y) else {
-        return Ok(Registered::skipped(SMALL));
+        return Ok(match request {
+            RegistrationRequest::Shift(shift) => {
+                let interpolation = Interpolation::default();
+                Registered::stated(Correction { shift, interpolation })
+            }
+            _ => Registered::skipped(SMALL),
+        });
     };
     let piece = masks(&Window { rows: rows.clone(), columns: columns.clone(), step: 1 })?;
     let y = y.slice(s![rows, columns]);
+    if let RegistrationRequest::Shift(shift) = request {
+        let interpolation = registration::interpolation(piece.view(), y, shift, proceed)?;
+        return Ok(Registered::stated(Correction { shift, interpolation }));
+    }
     let found = registration::register(piece.view(), y, proceed)?;
     Ok(found.map_or_else(|| Registered::skipped(DARK), Registered::from))
 }
 
-/// Share of the light of `y` \[H,W\] at pixels where the masks, moved by `shift`, are all dark or unknown.
+/// Share of the light of `y` \[H,W\] at pixels where the masks, corrected, are all dark or unknown.
 fn lost_light(
     y: ArrayView2<'_, f32>,
-    shift: [f64; 2],
+    correction: Correction,
     masks: impl Fn(&Window) -> Result<Array3<f32>>,
 ) -> Result<f64> {
     let (height, width) = y.dim();
@@ -70,7 +89,7 @@ fn lost_light(
             let rows = row..height.min(row + WINDOW);
             let columns = column..width.min(column + WINDOW);
             let place = Window { rows: rows.clone(), columns: columns.clone(), step: 1 };
-            let moved = moved_window((height, width), &place, shift, &masks)?;
+            let moved = moved_window((height, width), &place, correction, &masks)?;
             for (pixel, &y) in moved.lanes(Axis(0)).into_iter().zip(y.slice(s![rows, columns])) {
                 // `max` also replaces NaN, which were not measured.
                 let light = f64::from(y.max(0.0));
@@ -89,8 +108,7 @@ fn lost_light(
 fn without_estimate(request: RegistrationRequest, is_coloured: bool) -> Option<Option<Registered>> {
     match request {
         RegistrationRequest::Off => Some(None),
-        RegistrationRequest::Shift(shift) => Some(Some(Registered::stated(shift))),
-        RegistrationRequest::Auto => is_coloured.then(|| Some(Registered::skipped(COLOUR))),
+        _ => is_coloured.then(|| Some(Registered::skipped(COLOUR))),
     }
 }
 
@@ -103,10 +121,8 @@ pub fn register_stored(
     white: f32,
     monitor: &Monitor,
 ) -> Result<Option<Registered>> {
-    // Nothing is read if no masks are moved.
-    if let Some(outcome) = without_estimate(request, is_coloured)
-        && outcome.as_ref().is_none_or(|registered| !registered.applied)
-    {
+    // Without an estimate nothing is read.
+    if let Some(outcome) = without_estimate(request, is_coloured) {
         return Ok(outcome);
     }
     let y = arrays.snapshot(snapshots.first)? / white;
@@ -117,8 +133,58 @@ pub fn register_stored(
     })
 }
 
-/// Masks \[B,H,W\] in memory after they moved by `shift`, with NaN where their value is unknown.
-pub fn moved(masks: ArrayView3<'_, f32>, shift: [f64; 2]) -> Array3<f32> {
+/// Masks \[B,H,W\] in memory after a correction, with NaN where their value is unknown.
+pub fn moved(masks: ArrayView3<'_, f32>, correction: Correction) -> Array3<f32> {
     let (_, height, width) = masks.dim();
-    registration::Interpolated::new(masks).window(shift, 0..height, 0..width)
+    registration::Interpolated::new(masks, correction.interpolation).window(
+        correction.shift,
+        0..height,
+        0..width,
+    )
+}
+
+/// Moves stored masks in bands of rows, which go to `scratch`, an existing file. `step` gets the finished share, and then
+/// each moved mask \[H,W\], with NaN where its value is unknown.
+///
+/// Errors: those of reading, of writing and of `step`.
+pub fn correct(
+    masks: &Reader,
+    correction: Correction,
+    scratch: &Path,
+    mut step: impl FnMut(f64, Option<ArrayView2<'_, f32>>) -> Result<(), FormatError>,
+) -> Result<MaskStatistics, FormatError> {
+    let StackInfo { frames, height, width, .. } = *masks.info();
+    let bands: Vec<_> =
+        (0..height).step_by(BAND).map(|start| start..height.min(start + BAND)).collect();
+    let file = File::options().write(true).open(scratch).map_err(FormatError::io("open a file"))?;
+    // A frame of this file is a band of all masks.
+    let mut writer = planar::writer(BufWriter::new(file), bands.len(), frames * BAND, width)?;
+    for (index, rows) in bands.iter().enumerate() {
+        step(0.9 * index as f64 / bands.len() as f64, None)?;
+        let place = Window { rows: rows.clone(), columns: 0..width, step: 1 };
+        let moved = mask_window(masks, &place, Some(correction))?;
+        let mut band = Array2::zeros((frames * BAND, width));
+        for (mut part, mask) in band.axis_chunks_iter_mut(Axis(0), BAND).zip(moved.outer_iter()) {
+            part.slice_mut(s![..rows.len(), ..]).assign(&mask);
+        }
+        writer.write_frame(band.view())?;
+    }
+    writer.finish()?;
+    let moved = Reader::open(scratch, &Limits::default())?;
+    let (mut mask, mut light) =
+        (Array2::zeros((height, width)), Array2::<f64>::zeros((height, width)));
+    for frame in 0..frames {
+        for (index, rows) in bands.iter().enumerate() {
+            let part = frame * BAND..frame * BAND + rows.len();
+            let part = moved.read_window(index..index + 1, part, 0..width)?;
+            mask.slice_mut(s![rows.clone(), ..]).assign(&part.index_axis(Axis(0), 0));
+        }
+        light.zip_mut_with(&mask, |light, mask| *light += f64::from(mask.max(0.0)));
+        step(0.9 + 0.1 * frame as f64 / frames as f64, Some(mask.view()))?;
+    }
+    Ok(MaskStatistics {
+        dead_pixels: light.iter().filter(|light| **light == 0.0).count() as u64,
+        clipped_negative: 0,
+        mean: light.sum() / (frames * height * width) as f64,
+    })
 }

@@ -17,8 +17,8 @@ use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
 use crate::tables::things::{Calibration, Measurement};
 use crate::tables::workers::{self, Claimant};
 use engine::job::{
-    CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, MovieFormat, Sha256,
-    Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
+    CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Lab, MovieFormat, Registered,
+    Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
 };
 use engine::pipeline::derived::STACK;
 
@@ -70,8 +70,10 @@ pub struct JobTask {
 pub struct CheckTask {
     pub request: Request,
     pub limits: CheckLimits,
-    /// The calibration that the request names.
+    /// The calibration that the request names, or that of the job that it names.
     pub calibration: Option<Calibration>,
+    /// The registration of that job.
+    pub registered: Option<Registered>,
 }
 
 #[derive(Debug, Clone)]
@@ -350,11 +352,29 @@ impl Store {
         let request = requests::find(&mut connection, id).await?;
         let limits = requests::limits(&mut connection, id).await?;
         drop(connection);
-        let calibration = match request.submission.calibration() {
+        let (calibration, registered) = match request.submission.registration_of() {
+            Some(job) => self.corrected(&request.lab, job).await?.unzip(),
+            None => (request.submission.calibration(), None),
+        };
+        let calibration = match calibration {
             Some(id) => Some(self.thing_of_any_lab(id).await?),
             None => None,
         };
-        Ok(Work::Check(Box::new(CheckTask { request, limits, calibration })))
+        let registered = registered.flatten();
+        Ok(Work::Check(Box::new(CheckTask { request, limits, calibration, registered })))
+    }
+
+    /// The calibration and the registration of a job. `None` if it was deleted.
+    async fn corrected(
+        &self,
+        lab: &Lab,
+        job: JobId,
+    ) -> Result<Option<(CalibrationId, Option<Registered>)>> {
+        match self.job(lab, job).await {
+            Ok(job) => Ok(Some((job.spec.calibration, job.spec.registered))),
+            Err(StoreError::NotFound { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
     }
 
     async fn calibration_task(&self, id: CalibrationId) -> Result<Work> {

@@ -118,7 +118,7 @@ impl Core {
         let arrays = Arrays {
             masks: path(task.masks),
             snapshots: path(task.measurement),
-            shift: task.shift,
+            correction: task.correction,
         };
         let known = tokio::task::spawn_blocking(move || {
             let masks = Reader::open(&arrays.masks.0, &Limits::default())?;

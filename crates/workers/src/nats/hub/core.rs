@@ -13,6 +13,7 @@ use crate::nats::message::{Input, Notice, Program};
 use crate::nats::names;
 use crate::transport::TileTask;
 use engine::job::{JobId, Pool, Sha256, TaskId, WorkerId};
+use reconstruction::registration::Interpolation;
 use reconstruction::tile::Tile;
 use store::Store;
 
@@ -40,15 +41,16 @@ pub struct Undelivered {
 #[derive(PartialEq, Eq, Hash)]
 struct MaskWindow {
     masks: Sha256,
-    /// The bits of the shift.
-    shift: Option<[u64; 2]>,
+    /// The bits of the shift, and the interpolation.
+    correction: Option<([u64; 2], Interpolation)>,
     tile: Tile,
 }
 
 impl MaskWindow {
     fn of(task: &TileTask) -> Self {
-        let shift = task.shift.map(|shift| shift.map(f64::to_bits));
-        Self { masks: task.masks, shift, tile: task.tile }
+        let correction =
+            task.correction.map(|moved| (moved.shift.map(f64::to_bits), moved.interpolation));
+        Self { masks: task.masks, correction, tile: task.tile }
     }
 }
 

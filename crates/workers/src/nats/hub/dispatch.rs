@@ -167,8 +167,8 @@ impl Core {
             let place = task.tile.window();
             let frames = task.snapshots.start as usize..task.snapshots.end as usize;
             let window = match part {
-                Part::Masks => mask_window(&array, &place, task.shift),
-                Part::Snapshots => snapshot_window(&array, frames, &place, task.shift),
+                Part::Masks => mask_window(&array, &place, task.correction),
+                Part::Snapshots => snapshot_window(&array, frames, &place, task.correction),
             };
             arrays::to_bytes(window?.view())
         });
