@@ -434,7 +434,7 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
         tokio::time::sleep(std::time::Duration::from_millis(150 + 40 * kill as u64)).await;
         watcher.kill().await.unwrap();
     }
-    // Files that are not regular or contain no snapshots are ignored.
+    // Files that are not regular or contain no snapshots are not submitted.
     std::os::unix::fs::symlink(lab.path("masks.npy"), bench.join("link.npy")).unwrap();
     std::fs::create_dir(bench.join("folder.npy")).unwrap();
     std::fs::write(bench.join("notes.txt"), "mine").unwrap();
@@ -473,6 +473,7 @@ async fn a_watched_folder_submits_each_file_once_despite_kills() {
     let reason = std::fs::read_to_string(bench.join("bad.npy.failed.txt")).unwrap();
     assert!(reason.contains("invalid_content") && reason.contains("bad.npy"), "{reason}");
     assert!(!bench.join("link.npy.result").exists() && !bench.join("link.npy.failed.txt").exists());
+    std::fs::remove_file(bench.join("link.npy")).unwrap();
     // A restart has nothing to do; a changed file is a new one.
     assert!(start(true).wait().await.unwrap().success());
     std::fs::write(bench.join("bad.npy"), shot(7)).unwrap();
@@ -528,7 +529,7 @@ async fn mistakes_on_the_command_line_are_named() {
         (&["simulate", "--dispersion-offsets", "0:1:1000000"], "from 1 to 64"),
         // Opening a pipe would wait for its writer.
         (
-            &["reconstruct", "--masks", "pipe.npy", "--measurement", "pipe.npy"],
+            &["reconstruct", "--masks", "pipe.npy", "--measurement", "pipe.npy", "--out", "o"],
             "not a regular file",
         ),
     ];

@@ -136,8 +136,8 @@ impl Store {
         let writer = SqlitePoolOptions::new()
             .max_connections(1)
             .idle_timeout(None)
-            // SQLite opens a file read-only if it can't be written at this moment, and the connection stays so.
-            .max_lifetime(Duration::from_secs(60))
+            // After a disk that was read-only for a moment a connection may stay read-only.
+            .max_lifetime(Duration::from_secs(10))
             // After some errors, such as a full disk, SQLite has rolled back already. sqlx then fails to roll back
             // again and takes the transaction for open.
             .before_acquire(|connection, _| Box::pin(async { Ok(!connection.is_in_transaction()) }))
