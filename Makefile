@@ -183,8 +183,10 @@ eval-registration: evaluation-data $(TRAINING)/.stamp runtime ## test whether mo
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python research/assessment/registration.py run $${CARGO_TARGET_DIR:-target}/release/sci-recon \
-		--data $(DATA) --out eval-output/registration --algorithm $(ALGORITHM) --cases $(CASES)
+		--data $(DATA) --out eval-output/registration --algorithm $(ALGORITHM) --cases $(CASES) --first $(FIRST)
 CASES ?= 40
+# The first scene of the judges; those before it served the tuning.
+FIRST ?= 590
 
 eval-real: $(TRAINING)/.stamp ## compare the masks of published spectral captures with wrong ones; REAL=folder ALGORITHM=gap-tv
 	@$(CARGO) build --release --quiet

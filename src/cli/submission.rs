@@ -345,8 +345,8 @@ mod tests {
             ("webhook", "https://lab.example/hook"),
         ];
         let mut known: BTreeSet<&str> = values.iter().map(|(name, _)| *name).collect();
-        // It replaces the options of masks.
-        known.insert("calibration");
+        // They replace the options of masks.
+        known.extend(["calibration", "registration-of"]);
         let command = command();
         let options: BTreeSet<&str> =
             command.get_arguments().filter_map(|arg| arg.get_long()).collect();
@@ -359,8 +359,8 @@ mod tests {
         let sha256 = Sha256::of(b"file");
         let dispersion = arguments.dispersion.resolve().unwrap();
         let calibration = arguments.calibration_request(sha256, Some(sha256), dispersion);
-        // Captures of many files are for `calibrate`, the dashboard and the client libraries.
-        let expected = properties("CalibrationRequest", &["captures"]);
+        // Captures of many files are for `calibrate`, the dashboard and the client libraries; `registration_of` replaces files.
+        let expected = properties("CalibrationRequest", &["captures", "registration_of"]);
         assert_eq!(names(calibration.as_object().unwrap()), expected);
         let measurement = arguments.measurement_request("id", &[sha256]);
         assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
