@@ -29,7 +29,8 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %     masks = single(rand(256, 256, 8) > 0.5);
 %     frames = sci_recon(masks, sum(masks .* video, 3), 'url', 'http://server.lab:8080', 'algorithm', 'gap-tv');
 
-  if ischar(masks)
+  if ischar(masks) || isa(masks, 'string')
+    masks = char(masks);
     flags = varargin;
     if nargin > 1
       flags = [{measurement} varargin];

@@ -165,9 +165,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
 
     let (started, before) = (Instant::now(), cpu_seconds());
-    input.register(arguments.registration)?;
-    // The scale follows from the moved masks, as in a job.
-    let white = input.white()?;
+    let white = input.register(arguments.registration)?;
     let solver = match &setup.model {
         Some(model) => Solver::Network(&model.file),
         None => Solver::Schedule(&setup.schedule),
@@ -428,8 +426,8 @@ impl<'a> Input<'a> {
     }
 
     /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
-    /// known.
-    fn register(&mut self, request: RegistrationRequest) -> Result<()> {
+    /// known. Returns the white level, which follows from the moved masks unless they are misplaced.
+    fn register(&mut self, request: RegistrationRequest) -> Result<f32> {
         let white = self.white()?;
         let masks = self.masks.array.view();
         let is_coloured = self.mosaic.is_some() || self.sources.masks.dispersion.is_some();
@@ -462,8 +460,11 @@ impl<'a> Input<'a> {
             }
             self.masks.array = moved.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         }
+        let has_moved = registered
+            .as_ref()
+            .is_some_and(|registered| registered.applied && !registered.is_misplaced());
         self.registration = registered;
-        Ok(())
+        if has_moved { self.white() } else { Ok(white) }
     }
 
     fn recipe(

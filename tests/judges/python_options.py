@@ -19,7 +19,7 @@ def keywords(method):
 
 def main():
     contract = {schema: set(names) for schema, names in json.loads(sys.argv[1]).items()}
-    calibration = contract["CalibrationRequest"] - {"captures"}
+    calibration = contract["CalibrationRequest"] - {"captures", "registration_of"}
     measurement = contract["MeasurementRequest"]
     # The measurement names the calibration.
     job = contract["JobRequest"] - {"calibration"}

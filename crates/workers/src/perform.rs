@@ -55,7 +55,9 @@ pub(super) fn perform(
             let job = (&arrays, snapshots);
             let registration =
                 registration::register_stored(job, (registration, is_coloured), white, monitor)?;
-            let correction = registration.as_ref().and_then(Registered::correction);
+            // Misplaced masks see too little light for a level of their own.
+            let fits = registration.as_ref().filter(|registered| !registered.is_misplaced());
+            let correction = fits.and_then(Registered::correction);
             if correction.is_some() {
                 // Behind masks elsewhere, pixels that seem dark have light, and the scene seems too bright.
                 let arrays = Arrays { correction, ..arrays };

@@ -113,6 +113,11 @@ impl Registered {
         }
     }
 
+    /// True if the moved masks explain no light in a large part of the picture.
+    pub fn is_misplaced(&self) -> bool {
+        self.lost_light.is_some_and(|lost| lost > MISPLACED)
+    }
+
     /// The findings on masks that the job has moved.
     pub fn findings(&self) -> Vec<Finding> {
         let Some(Correction { shift: [rows, columns], .. }) = self.correction() else {

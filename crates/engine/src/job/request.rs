@@ -357,7 +357,8 @@ impl JobSpec {
         let tiles = self.tile_plan().map_or(0, area) * frames;
         let values = voxels * self.shape.channels().count() as u64;
         let rows = self.shape.height as u64 * frames;
-        let results = values * RESULT_BYTES + rows * ROW_BYTES + SNAPSHOT_BYTES;
+        // The map of expected errors has a value of 4 bytes for 16x16 pixels of a frame.
+        let results = values * RESULT_BYTES + values / 32 + rows * ROW_BYTES + SNAPSHOT_BYTES;
         u64::from(self.snapshots.count) * results + self.snapshots_computed() * tiles * TILE_BYTES
     }
 }

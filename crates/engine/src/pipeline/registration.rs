@@ -13,6 +13,7 @@ use crate::job::{Registered, RegistrationRequest, SnapshotRange, TaskStage};
 use formats::planar::{self, Reader};
 use formats::validate::MaskStatistics;
 use formats::{FormatError, Limits, StackInfo};
+use reconstruction::ReconError;
 use reconstruction::registration::{self, Correction, Interpolation};
 use reconstruction::tile::Window;
 
@@ -45,7 +46,7 @@ pub fn register(
     }
     let mut registered = estimate(request, light()?.view(), y, &masks, proceed)?;
     if let Some(correction) = registered.correction() {
-        registered.lost_light = Some(lost_light(y, correction, masks)?);
+        registered.lost_light = Some(lost_light(y, correction, masks, proceed)?);
     }
     Ok(Some(registered))
 }
@@ -81,10 +82,14 @@ fn lost_light(
     y: ArrayView2<'_, f32>,
     correction: Correction,
     masks: impl Fn(&Window) -> Result<Array3<f32>>,
+    proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<f64> {
     let (height, width) = y.dim();
     let (mut lost, mut all) = (0.0, 0.0);
     for row in (0..height).step_by(WINDOW) {
+        if !proceed(1.0) {
+            return Err(ReconError::Cancelled.into());
+        }
         for column in (0..width).step_by(WINDOW) {
             let rows = row..height.min(row + WINDOW);
             let columns = column..width.min(column + WINDOW);
