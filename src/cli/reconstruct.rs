@@ -426,7 +426,7 @@ impl<'a> Input<'a> {
     }
 
     /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
-    /// known. Returns the white level, which follows from the moved masks unless they are misplaced.
+    /// known. Returns the white level.
     fn register(&mut self, request: RegistrationRequest) -> Result<f32> {
         let white = self.white()?;
         let masks = self.masks.array.view();
@@ -460,11 +460,9 @@ impl<'a> Input<'a> {
             }
             self.masks.array = moved.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
         }
-        let has_moved = registered
-            .as_ref()
-            .is_some_and(|registered| registered.applied && !registered.is_misplaced());
         self.registration = registered;
-        if has_moved { self.white() } else { Ok(white) }
+        let changes_white = self.registration.as_ref().is_some_and(Registered::changes_white_level);
+        if changes_white { self.white() } else { Ok(white) }
     }
 
     fn recipe(

@@ -10,7 +10,7 @@ use super::check::check;
 use super::model_process::ModelProcesses;
 use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, TransportError};
 use engine::intake::{self, Calibrated, IntakeError, Report, calibrate};
-use engine::job::{Assessment, Registered, Sha256, SnapshotRange, TaskProgress, TaskStage};
+use engine::job::{Assessment, Sha256, SnapshotRange, TaskProgress, TaskStage};
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::assessment::TileAssessment;
@@ -55,12 +55,9 @@ pub(super) fn perform(
             let job = (&arrays, snapshots);
             let registration =
                 registration::register_stored(job, (registration, is_coloured), white, monitor)?;
-            // Misplaced masks see too little light for a level of their own.
-            let fits = registration.as_ref().filter(|registered| !registered.is_misplaced());
-            let correction = fits.and_then(Registered::correction);
-            if correction.is_some() {
-                // Behind masks elsewhere, pixels that seem dark have light, and the scene seems too bright.
-                let arrays = Arrays { correction, ..arrays };
+            // Behind masks elsewhere, pixels that seem dark have light, and the scene seems too bright.
+            if let Some(registered) = registration.as_ref().filter(|it| it.changes_white_level()) {
+                let arrays = Arrays { correction: registered.correction(), ..arrays };
                 white = scale::job_white_level(&arrays, snapshots, monitor)?;
             }
             monitor.reach(TaskStage::Reading, 1.0);

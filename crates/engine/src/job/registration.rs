@@ -113,9 +113,10 @@ impl Registered {
         }
     }
 
-    /// True if the moved masks explain no light in a large part of the picture.
-    pub fn is_misplaced(&self) -> bool {
-        self.lost_light.is_some_and(|lost| lost > MISPLACED)
+    /// True if the white level must be estimated again, with the moved masks. Where these see too little of the light, the level
+    /// of the calibrated masks is kept.
+    pub fn changes_white_level(&self) -> bool {
+        self.applied && self.lost_light.is_none_or(|lost| lost <= MISPLACED)
     }
 
     /// The findings on masks that the job has moved.
