@@ -435,8 +435,7 @@ impl<'a> Input<'a> {
             let text = "--registration: masks of a colour sensor or spectral camera are not moved; calibrate again";
             return Err(CliError::Input(text.into()));
         }
-        let light =
-            || Ok(masks.mapv(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0)));
+        let light = || Ok(masks.sum_axis(Axis(0)));
         let y = &self.measurement.array.index_axis(Axis(0), 0) / white;
         let piece = |place: &Window| {
             Ok(masks.slice(s![.., place.rows.clone(), place.columns.clone()]).to_owned())

@@ -43,6 +43,7 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
             tracing::warn!(reason, "the worker is not confined");
         }
     }
+    reconstruction::cores::start_threads(cores);
     let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
     let network = NetworkSource::new(library, Device::parse(&settings.engine.device)?);
     let failed = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());

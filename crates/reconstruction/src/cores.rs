@@ -11,6 +11,12 @@ const MAX_CORES: usize = 8;
 #[derive(Debug, Clone)]
 pub struct Cores(Arc<AtomicUsize>);
 
+/// Starts the threads that the reconstructions of this process share: no more than one of them may use.
+pub fn start_threads(cores: usize) {
+    // A pool that has started already does the same work.
+    let _ = rayon::ThreadPoolBuilder::new().num_threads(cores.clamp(1, MAX_CORES)).build_global();
+}
+
 impl Default for Cores {
     /// One core.
     fn default() -> Self {

@@ -26,6 +26,8 @@ use store::{Heartbeat, Lease};
 
 /// Time between heartbeats, which is the longest time until the worker learns of a cancellation.
 const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Heartbeats for which more cores must be free before a task takes them, because each change loads its networks again.
+const BEATS_WITH_MORE: u32 = 5;
 /// Longest time between attempts to claim a task.
 const POLL: Duration = Duration::from_millis(200);
 /// Time between two signs of life of an idle worker.
@@ -143,7 +145,7 @@ impl<T: Transport> Worker<T> {
     async fn work(&mut self, claim: Claim) -> Result<(), WorkerError> {
         let Claim { lease, span, cost, input } = claim;
         let monitor = Arc::new(Monitor::default());
-        self.share_cores().await;
+        self.cores.set(self.share().await);
         let patience = self.stall + Duration::from_secs_f64(SLOWNESS * cost);
         let computing = self.start(input, &monitor, span.clone());
         let watched = async {
@@ -253,6 +255,7 @@ impl<T: Transport> Worker<T> {
         };
         let called_off = self.transport.called_off(lease);
         tokio::pin!(grace_over, called_off);
+        let mut beats_with_more = 0;
         loop {
             let silence = monitor.silence();
             if silence > patience {
@@ -274,7 +277,11 @@ impl<T: Transport> Worker<T> {
                         // If this persists, the lease expires, and the store reports it lost.
                         Err(error) => tracing::error!(%error, "a heartbeat is not recorded"),
                     }
-                    self.share_cores().await;
+                    let share = self.share().await;
+                    beats_with_more = if share > self.cores.count() { beats_with_more + 1 } else { 0 };
+                    if share < self.cores.count() || beats_with_more == BEATS_WITH_MORE {
+                        self.cores.set(share);
+                    }
                 }
             }
             if reason.is_some() {
@@ -283,11 +290,15 @@ impl<T: Transport> Worker<T> {
         }
     }
 
-    /// Divides the cores of this machine among the workers that compute. The task follows at its next iteration.
-    async fn share_cores(&self) {
+    /// This worker's share of the cores of this machine, which the workers that compute divide. The present one if the others
+    /// are unknown.
+    async fn share(&self) -> usize {
         match self.transport.busy_workers().await {
-            Ok(busy) => self.cores.set(busy.map_or(1, |busy| self.machine_cores / busy.max(1))),
-            Err(error) => tracing::warn!(%error, "the number of busy workers is unknown"),
+            Ok(busy) => busy.map_or(1, |busy| self.machine_cores / busy.max(1)),
+            Err(error) => {
+                tracing::warn!(%error, "the number of busy workers is unknown");
+                self.cores.count()
+            }
         }
     }
 

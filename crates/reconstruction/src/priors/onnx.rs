@@ -200,7 +200,7 @@ pub struct ClipNetwork {
     name: String,
     model: Cow<'static, [u8]>,
     runtime: Runtime,
-    /// The session and its number of threads; none after a failure to load it.
+    /// The session and the number of cores for which it was loaded; none after a failure to load it.
     session: Option<(usize, Session)>,
 }
 
@@ -231,7 +231,11 @@ impl ClipNetwork {
         let kept = session.take().filter(|(count, _)| *count == threads);
         let loaded = match kept {
             Some(kept) => kept,
-            None => (threads, runtime.session(name, model, threads)?),
+            // The memory limit may leave no room for the stacks of threads.
+            None => match runtime.session(name, model, threads) {
+                Err(_) if threads > 1 => (threads, runtime.session(name, model, 1)?),
+                loaded => (threads, loaded?),
+            },
         };
         Ok(&mut session.insert(loaded).1)
     }

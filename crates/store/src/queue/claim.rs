@@ -14,7 +14,7 @@ use crate::error::{Result, StoreError};
 use crate::tables::jobs;
 use crate::tables::requests::{self, Request};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
-use crate::tables::things::{Calibration, Measurement};
+use crate::tables::things::{Calibration, Measurement, Thing};
 use crate::tables::workers::{self, Claimant};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Lab, MovieFormat, Registered,
@@ -352,26 +352,28 @@ impl Store {
         let request = requests::find(&mut connection, id).await?;
         let limits = requests::limits(&mut connection, id).await?;
         drop(connection);
-        let (calibration, registered) = match request.submission.registration_of() {
-            Some(job) => self.corrected(&request.lab, job).await?.unzip(),
-            None => (request.submission.calibration(), None),
-        };
-        let calibration = match calibration {
-            Some(id) => Some(self.thing_of_any_lab(id).await?),
-            None => None,
+        let stated = request.submission.calibration();
+        let (calibration, registered) = match (request.submission.registration_of(), stated) {
+            (Some(job), _) => self.corrected(&request.lab, job).await?.unzip(),
+            (None, Some(id)) => (Some(self.thing_of_any_lab(id).await?), None),
+            (None, None) => (None, None),
         };
         let registered = registered.flatten();
         Ok(Work::Check(Box::new(CheckTask { request, limits, calibration, registered })))
     }
 
-    /// The calibration and the registration of a job. `None` if it was deleted.
+    /// The calibration and the registration of a job. `None` if one was deleted.
     async fn corrected(
         &self,
         lab: &Lab,
         job: JobId,
-    ) -> Result<Option<(CalibrationId, Option<Registered>)>> {
-        match self.job(lab, job).await {
-            Ok(job) => Ok(Some((job.spec.calibration, job.spec.registered))),
+    ) -> Result<Option<(Thing<CalibrationId>, Option<Registered>)>> {
+        let found = async {
+            let job = self.job(lab, job).await?;
+            Ok((self.thing_of_any_lab(job.spec.calibration).await?, job.spec.registered))
+        };
+        match found.await {
+            Ok(found) => Ok(Some(found)),
             Err(StoreError::NotFound { .. }) => Ok(None),
             Err(error) => Err(error),
         }
