@@ -113,7 +113,7 @@ impl Registered {
         }
     }
 
-    /// True if the white level must be estimated again, with the moved masks. Where these see too little of the light, the level
+    /// True if the white level follows the moved masks. Masks that see too little of the light give no white level, so that
     /// of the calibrated masks is kept.
     pub fn changes_white_level(&self) -> bool {
         self.applied && self.lost_light.is_none_or(|lost| lost <= MISPLACED)
