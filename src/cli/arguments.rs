@@ -51,7 +51,7 @@ pub(super) struct MaskFileArguments {
     pub(super) masks_crop: Option<Crop>,
     /// First and last mask, both included, counted from 0 [default: all masks].
     #[arg(long, value_name = "FIRST-LAST", value_parser = frame_range)]
-    pub(super) masks_frames: Option<(usize, usize)>,
+    pub(super) masks_frames: Option<[usize; 2]>,
     /// How the pixels of the masks are packed [default: one number per pixel].
     #[arg(long, value_name = "NAME", value_parser = named::<Packing>())]
     pub(super) masks_packing: Option<Packing>,
@@ -301,9 +301,9 @@ where
 }
 
 /// Parses `FIRST-LAST`: first and last frame, both included, counted from 0.
-pub(super) fn frame_range(text: &str) -> Result<(usize, usize), String> {
+pub(super) fn frame_range(text: &str) -> Result<[usize; 2], String> {
     match text.parse::<Snapshots>()? {
-        Snapshots { first, last: Some(last) } => Ok((first, last)),
+        Snapshots { first, last: Some(last) } => Ok([first, last]),
         Snapshots { last: None, .. } => {
             Err("name one index, or FIRST-LAST with both ends in".to_owned())
         }

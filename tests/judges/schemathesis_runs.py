@@ -6,6 +6,7 @@ answer is a server error, undocumented, or violates its schema, if another lab's
 too few examples were tried.
 """
 
+import atexit
 import json
 import os
 import pathlib
@@ -35,6 +36,8 @@ class Service:
             stdout=subprocess.PIPE,
             env=dict(os.environ, RUST_LOG="error"),
         )
+        # A run that fails must not leave a service behind.
+        atexit.register(self.process.kill)
         self.url = json.loads(self.process.stdout.readline())["url"]
 
     def token(self, lab):

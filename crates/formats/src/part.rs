@@ -50,7 +50,7 @@ pub struct Part {
     /// The window of each frame; `None` for whole frames.
     pub crop: Option<Crop>,
     /// First and last frame, both included, counted from 0; `None` for all frames.
-    pub frames: Option<(usize, usize)>,
+    pub frames: Option<[usize; 2]>,
 }
 
 /// An order of bits in which 12-bit cameras pack two pixels into three bytes.
@@ -93,7 +93,7 @@ impl Part {
             );
             return Err(FormatError::Part { field: "crop", detail });
         }
-        let (first, last) = self.frames.unwrap_or((0, all.frames - 1));
+        let [first, last] = self.frames.unwrap_or([0, all.frames - 1]);
         if first > last || last >= all.frames {
             let detail = format!(
                 "frames {first} to {last} are not in the file, which has {} frames, counted from 0",
@@ -238,7 +238,7 @@ mod tests {
     fn a_window_and_a_range_of_frames_are_selected() {
         let (stack, bytes) = stack();
         let crop = Crop { row: 1, column: 2, height: 4, width: 6 };
-        let part = Part { crop: Some(crop), frames: Some((1, 3)) };
+        let part = Part { crop: Some(crop), frames: Some([1, 3]) };
         let (info, found) = open(&bytes, Wanted { part, ..SceneArray::Masks.into() }).unwrap();
         assert_eq!((info.frames, info.height, info.width), (3, 4, 6));
         assert_eq!(found, stack.slice(s![1..4, 1..5, 2..8]));
@@ -249,8 +249,8 @@ mod tests {
                 Part { crop: Some(Crop { column: usize::MAX, ..crop }), frames: None },
                 ["4x6", "6x8"],
             ),
-            (Part { crop: None, frames: Some((2, 5)) }, ["frames 2 to 5", "5 frames"]),
-            (Part { crop: None, frames: Some((2, 1)) }, ["frames 2 to 1", "5 frames"]),
+            (Part { crop: None, frames: Some([2, 5]) }, ["frames 2 to 5", "5 frames"]),
+            (Part { crop: None, frames: Some([2, 1]) }, ["frames 2 to 1", "5 frames"]),
         ] {
             let error = open(&bytes, Wanted { part, ..SceneArray::Masks.into() }).unwrap_err();
             assert!(matches!(error, FormatError::Part { .. }), "{error:?}");

@@ -1,6 +1,5 @@
 #!/usr/bin/env bash
-# Checks the contract with linters and client generators: none may report an error, and the generators must not
-# warn. Needs node, npm and Python 3.
+# Checks the contract with linters and client generators: none may warn. Needs node, npm and Python 3.
 #
 #   tests/judges/clients/run.sh FOLDER     FOLDER keeps the tools for the next run
 set -euo pipefail
@@ -16,12 +15,13 @@ export PATH=$tools/node_modules/.bin:$tools/python/bin:$PATH
 out=$(mktemp -d)
 trap 'rm -rf "$out"' EXIT
 
-redocly lint --format summary "$contract"
-spectral lint --ruleset "$here/spectral.yaml" "$contract"
+redocly lint --config "$here/redocly.yaml" --format summary "$contract" 2>&1 | tee "$out/redocly.log"
+if grep -q 'You have' "$out/redocly.log"; then exit 1; fi
+spectral lint --fail-severity warn --ruleset "$here/spectral.yaml" "$contract"
 openapi-typescript "$contract" --output "$out/api.d.ts" 2>&1 | tee "$out/typescript.log"
 if grep -qi warn "$out/typescript.log"; then exit 1; fi
 tsc --noEmit --strict "$out/api.d.ts"
 openapi-python-client generate --path "$contract" --config "$here/openapi-python-client.yaml" \
   --output-path "$out/client" --fail-on-warning
 python -m compileall -q "$out/client"
-echo '{"clients": "generated without a warning", "linters": "no error"}'
+echo '{"clients": "generated without a warning", "linters": "no warning"}'

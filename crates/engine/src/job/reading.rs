@@ -23,7 +23,7 @@ pub struct Reading {
     /// The window of each picture; `None` for whole pictures.
     pub crop: Option<Crop>,
     /// First and last frame, both included; `None` for all frames.
-    pub frames: Option<(usize, usize)>,
+    pub frames: Option<[usize; 2]>,
     /// How pixels are packed; `None` for one number per pixel.
     pub packing: Option<Packing>,
 }

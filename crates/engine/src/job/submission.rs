@@ -41,7 +41,7 @@ pub struct CalibrationRequest {
     pub crop: Option<Crop>,
     /// First and last mask, both included, counted from 0; by default all masks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub frames: Option<(usize, usize)>,
+    pub frames: Option<[usize; 2]>,
     /// How the pixels are packed; by default one number per pixel.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub packing: Option<Packing>,
