@@ -13,7 +13,7 @@ use strum::IntoStaticStr;
 
 #[cfg(feature = "nats")]
 use engine::job::{Pool, Webhook, WorkerId};
-use engine::pipeline::networks::{NetworkError, find_library};
+use engine::pipeline::networks::{NetworkError, NetworkSource, find_library};
 use reconstruction::priors::onnx::Device;
 use store::Claimant;
 
@@ -390,6 +390,11 @@ pub struct EngineArguments {
           value_parser = device)]
     pub device: String,
 
+    /// Folder with networks that replace the built-in ones: fastdvdnet-gray/stage1.onnx and stage2.onnx, or
+    /// ffdnet-gray/model.onnx. Workers on other machines need the same. Manifests have their hashes.
+    #[arg(long, env = "SCI_RECON_MODELS", value_name = "FOLDER")]
+    pub models: Option<PathBuf>,
+
     /// Nice value of workers (0 to 19), so that the API responds under full load. A process with a higher nice value keeps
     /// it.
     #[arg(long, env = "SCI_RECON_NICE", value_name = "N", default_value_t = 10,
@@ -556,6 +561,17 @@ impl EngineArguments {
         find_library(self.onnxruntime.as_deref()).map(drop)
     }
 
+    /// The networks on the device.
+    ///
+    /// # Errors
+    /// The device can't be read, or `--models` has no networks.
+    pub fn source(&self) -> Result<NetworkSource, NetworkError> {
+        // An empty variable counts as not set.
+        let library = self.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
+        let device = Device::parse(&self.device)?;
+        NetworkSource::new(library, device).with_models(self.models.as_deref())
+    }
+
     /// Name of the execution provider for the device. Workers refuse a device that can't be read,
     /// with the reason.
     #[must_use]
@@ -596,6 +612,9 @@ impl WorkerArguments {
         option("--log-format", format.into());
         if let Some(library) = &self.engine.onnxruntime {
             option("--onnxruntime", library.clone().into());
+        }
+        if let Some(models) = &self.engine.models {
+            option("--models", models.clone().into());
         }
         option("--takes", self.takes.into_str().into());
         if let Some(id) = self.id {

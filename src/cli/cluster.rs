@@ -9,6 +9,8 @@ use super::output::print_line;
 use super::wait::wait;
 use crate::config::{NatsArguments, VERSION};
 use engine::job::{Pool, Timestamp};
+use engine::pipeline::networks::NetworkSource;
+use reconstruction::priors::onnx::Device;
 use workers::nats::{Authority, Check, ClusterError, Node, Program, ServerVersion, configuration};
 
 /// Set up workers on other machines: keys, credentials, connection.
@@ -194,7 +196,8 @@ fn credentials(command: &WorkerCommand) -> Result<(), CliError> {
 
 fn examine(check: &CheckArguments) -> Result<(), CliError> {
     let NatsArguments { nats, nats_creds } = &check.nats;
-    let checks = wait(Check::run(nats.as_deref(), nats_creds.as_deref(), Program::of(VERSION)))?;
+    let program = Program::of(VERSION, &NetworkSource::new(None, Device::Cpu));
+    let checks = wait(Check::run(nats.as_deref(), nats_creds.as_deref(), program))?;
     let bad = checks.iter().filter(|check| !check.good).count();
     for Check { what, good, found } in checks {
         print_line(format!("{} {what}: {found}", if good { "ok     " } else { "missing" }))?;

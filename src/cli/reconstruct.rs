@@ -141,8 +141,14 @@ struct Setup {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     let schedule = arguments.schedule.resolve()?;
-    let network = arguments.engine.network()?.with_models(arguments.models.clone());
+    let models = arguments.models.as_deref();
+    let network = arguments.engine.network()?.with_models(models);
+    let network = network.map_err(|error| CliError::Input(error.to_string()))?;
     let schedule = network.suited(schedule);
+    if let Some(folder) = models.filter(|_| !network.replaces(&schedule)) {
+        let detail = "has no network of this algorithm; name another algorithm, or omit --models";
+        return Err(CliError::Input(format!("the folder {} {detail}", folder.display())));
+    }
     let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
@@ -219,7 +225,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let recipe = input.recipe(&setup, (white, white_level), &solved)?;
     let expected = |snapshot| {
         let assessments = solved.assessments(&sequence, snapshot, &recipe.schedule);
-        recipe.expected(snapshot, &assessments)
+        // The quality model is fitted to the embedded networks.
+        let fits = !setup.network.replaces(&recipe.schedule);
+        fits.then(|| recipe.expected(snapshot, &assessments)).flatten()
     };
     let expected: Vec<_> = input.snapshots().map(expected).collect();
     let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
@@ -471,7 +479,7 @@ impl<'a> Input<'a> {
         solved: &Solved,
     ) -> Result<Recipe> {
         let pilot = solved.pilot.clone();
-        let mut models = setup.network.records(&setup.schedule)?;
+        let mut models = setup.network.records(&setup.schedule);
         models.extend(setup.model.as_ref().map(Model::record));
         Ok(Recipe {
             program_version: VERSION,

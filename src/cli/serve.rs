@@ -21,6 +21,7 @@ use crate::config::{
     ConfigError, DeviceState, EngineArguments, ServeArguments, Takes, WorkerArguments,
 };
 use crate::http::{App, Machine, Metrics, listen, router};
+use engine::pipeline::networks::{NetworkError, NetworkSource};
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
 use workers::nats::{
@@ -37,6 +38,9 @@ pub enum ServeError {
     /// A setting is wrong.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// The device can't be read, or the folder of networks is not one.
+    #[error(transparent)]
+    Networks(#[from] NetworkError),
     /// The store can't be opened.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -73,6 +77,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let accept_database = settings.accept_database;
     let store = Store::open(&settings.data, Purpose::Serve { accept_database }).await?;
     settings.check(store.is_open().await?)?;
+    let networks = settings.engine.source()?;
     // 2. Clean up after an earlier server.
     let swept = store.dir().sweep_tmp()?;
     store.finish_removals().await?;
@@ -104,7 +109,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
     #[cfg(feature = "nats")]
-    let hub = cluster(settings, &store).await?;
+    let hub = cluster(settings, &networks, &store).await?;
     #[cfg(not(feature = "nats"))]
     store.disown_remote().await?;
     #[cfg(feature = "nats")]
@@ -141,7 +146,7 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         let _ = stopper.send(true);
     });
     // 5. Serve the API.
-    let machine = Machine { cluster: trouble, confinement, device: device_state };
+    let machine = Machine { cluster: trouble, confinement, networks, device: device_state };
     let app = App::new(store.clone(), (settings, audit), metrics, machine, closing);
     let service = router(app);
     tokio::select! {
@@ -201,7 +206,11 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
 
 /// Starts to hand out tiles to other machines, if a NATS server is configured.
 #[cfg(feature = "nats")]
-async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>, ServeError> {
+async fn cluster(
+    settings: &ServeArguments,
+    networks: &NetworkSource,
+    store: &Store,
+) -> Result<Option<Hub>, ServeError> {
     let ClusterArguments { nats, ack_wait, verify_fraction } = &settings.cluster;
     if !nats.is_wanted() {
         store.disown_remote().await?;
@@ -212,7 +221,7 @@ async fn cluster(settings: &ServeArguments, store: &Store) -> Result<Option<Hub>
     let access =
         Access::new(nats.nats.as_deref(), &credential.unwrap_or_default(), "sci-recon hub")?;
     let settings = HubSettings {
-        program: Program::of(VERSION),
+        program: Program::of(VERSION, networks),
         ack_wait: Duration::from_secs(*ack_wait),
         verify_fraction: *verify_fraction,
     };

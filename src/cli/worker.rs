@@ -18,7 +18,7 @@ use crate::cli::error::Result;
 use crate::config::VERSION;
 use crate::config::WorkerArguments;
 use engine::job::WorkerId;
-use engine::pipeline::NetworkSource;
+use engine::pipeline::networks::NetworkSource;
 use reconstruction::priors::onnx::Device;
 use store::{Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
@@ -34,6 +34,9 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
     if let Some(bytes) = settings.memory_limit() {
         limit_memory(bytes).map_err(CliError::Failure)?;
     }
+    let failed = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
+    // A confined worker can't read the folder of networks.
+    let network = settings.engine.source().map_err(|error| CliError::Input(error.to_string()))?;
     // The driver of a GPU needs files that can't be listed.
     let is_confined = !settings.engine.unconfined && settings.engine.device == "cpu";
     if let Some(data) = settings.data_folder().filter(|_| is_confined) {
@@ -44,9 +47,6 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
         }
     }
     reconstruction::cores::start_threads(cores);
-    let library = settings.engine.onnxruntime.clone().filter(|path| !path.as_os_str().is_empty());
-    let network = NetworkSource::new(library, Device::parse(&settings.engine.device)?);
-    let failed = |error: &dyn std::fmt::Display| CliError::Failure(error.to_string());
     let program = std::env::current_exe().map_err(|error| failed(&error))?;
     let model = model_command(settings, program);
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -112,7 +112,7 @@ async fn work(
     let stall = Duration::from_secs(settings.engine.stall_seconds);
     #[cfg(feature = "nats")]
     if settings.remote.nats.is_wanted() {
-        let remote = remote_settings(settings);
+        let remote = remote_settings(settings, &network);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
         let ended = Worker::new(remote.clone(), network, model, cores, stall, stop).run().await;
         if let Some(refusal) = remote.refusal() {
@@ -130,10 +130,10 @@ async fn work(
 }
 
 #[cfg(feature = "nats")]
-fn remote_settings(settings: &WorkerArguments) -> RemoteSettings {
+fn remote_settings(settings: &WorkerArguments, network: &NetworkSource) -> RemoteSettings {
     let remote = &settings.remote;
     RemoteSettings {
-        program: Program::of(VERSION),
+        program: Program::of(VERSION, network),
         urls: remote.nats.nats.clone(),
         credential: remote.nats.nats_creds.clone(),
         pool: remote.pool.clone(),

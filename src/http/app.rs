@@ -20,6 +20,7 @@ use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
 use crate::config::{DeviceState, ServeArguments};
 use engine::job::{Timestamp, TokenId, without_paths};
+use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::quality::Quality;
 use formats::Limits;
 use store::Store;
@@ -72,6 +73,8 @@ pub struct Machine {
     pub cluster: Option<watch::Receiver<Option<String>>>,
     /// Why networks of users can read files of labs, if they can.
     pub confinement: std::result::Result<(), String>,
+    /// The networks of the service.
+    pub networks: NetworkSource,
     /// State of the device that runs networks.
     pub device: watch::Receiver<DeviceState>,
 }

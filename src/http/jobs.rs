@@ -350,11 +350,14 @@ async fn resolve(app: &App, access: &Access, mut request: JobRequest) -> Result<
             Some(model.map_err(|error| ApiError::reference("/model", error))?.into())
         }
     };
-    if request.algorithm != Algorithm::Learned && app.has_gpu().await? {
+    let networks = &app.machine.networks;
+    if request.algorithm != Algorithm::Learned {
         // All tiles use one network, on any worker.
         let schedule = request.schedule.take();
         let schedule = schedule.unwrap_or_else(|| request.algorithm.default_schedule());
-        request.schedule = Some(schedule.with_float_networks());
+        let has_gpu = app.has_gpu().await?;
+        let schedule = if has_gpu { schedule.with_float_networks() } else { schedule };
+        request.schedule = Some(networks.suited(schedule));
     }
     let resolved = request.resolve(calibration.id, shape, measurement.sequence, model);
     let resolved = invalid_priority.map_or(resolved, |error| Err(vec![error]));
@@ -363,6 +366,7 @@ async fn resolve(app: &App, access: &Access, mut request: JobRequest) -> Result<
     // If the report is not finished yet, the task that writes it adds the warning. A bad calibration causes other findings,
     // so it comes first.
     let report = app.store.report(calibration.id).await?;
+    spec.networks = networks.records(&spec.schedule);
     spec.warnings = report.and_then(|report| report.warning()).into_iter().collect();
     spec.warnings.extend(warnings_of(measurement.warnings, spec.snapshots));
     check_memory(app, &spec)?;

@@ -13,13 +13,13 @@ use tokio::sync::Mutex;
 use super::transport::{
     Check, Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
 };
-use engine::job::{Registered, Sha256, TaskKind, TaskProgress, WorkerId};
+use engine::job::{ModelRecord, Registered, Sha256, TaskKind, TaskProgress, WorkerId};
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::blend::StoredTile;
 use engine::pipeline::manifest::{CameraRecord, Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::movie::{DisplayWindow, MovieTask};
-use engine::pipeline::networks::{ModelFile, ModelRecord};
+use engine::pipeline::networks::ModelFile;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::records::{PilotRecord, PreparedRecord, WhiteRecord};
 use engine::pipeline::tile::TileInput;
@@ -375,6 +375,7 @@ pub fn tile_task(task: &JobTask, first: u32, index: u32) -> Result<TileTask, Pip
         schedule: full_schedule(&task.spec.schedule, pilot.as_ref()),
         evidence: pilot.as_ref().and_then(|pilot| pilot.evidence.clone()),
         model: task.spec.model.as_ref().map(|model| model.sha256),
+        networks: task.spec.networks.clone(),
     })
 }
 

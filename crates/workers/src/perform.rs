@@ -264,6 +264,7 @@ fn tile(
     monitor: &Monitor,
 ) -> Result<(TileTaskRecord, Array3<f32>), PipelineError> {
     let Engines { networks, models } = engines;
+    networks.source().check(&task.schedule, &task.networks)?;
     let model_provider = models.command().provider;
     let before_fetch = cpu_seconds();
     // Fetches all files of the task, including the network's.
@@ -301,8 +302,10 @@ fn tile(
         peak_rss_bytes: peak_rss_bytes() + process_peak,
     };
     let solved = task.pieces.iter().flat_map(Clone::clone).collect();
+    // The quality model is fitted to the embedded networks.
     let assessment = match task.model {
         Some(_) => None,
+        None if source.replaces(&task.schedule) => None,
         None => TileAssessment::of(&outcome, (&task.schedule, task.evidence.as_ref(), task.white)),
     };
     let tile = TileRecord::from(&outcome);

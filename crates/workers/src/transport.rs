@@ -13,8 +13,8 @@ use tokio::runtime::Handle;
 
 use engine::intake::{CaptureFiles, IntakeError};
 use engine::job::{
-    JobId, JobSpec, Mosaic, RegistrationRequest, SceneShape, Schedule, Sha256, SnapshotRange,
-    TaskProgress, WrittenFile,
+    JobId, JobSpec, ModelRecord, Mosaic, RegistrationRequest, SceneShape, Schedule, Sha256,
+    SnapshotRange, TaskProgress, WrittenFile,
 };
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
@@ -205,6 +205,8 @@ pub struct TileTask {
     /// The schedule after the pilot. It has no stages if there is a model.
     pub schedule: Schedule,
     pub model: Option<Sha256>,
+    /// The networks of the schedule at the submission of the job.
+    pub networks: Vec<ModelRecord>,
     /// The pilot's evidence on the error of the frames.
     #[serde(default)]
     pub evidence: Option<Evidence>,

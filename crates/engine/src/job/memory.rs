@@ -120,6 +120,7 @@ mod tests {
             run: RunSpec::ALONE,
             algorithm,
             model: None,
+            networks: Vec::new(),
             schedule: algorithm.default_schedule(),
             tile: TileSpec { size: side, overlap: 0 },
             registration: crate::job::RegistrationRequest::Off,

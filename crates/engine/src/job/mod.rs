@@ -27,7 +27,7 @@ pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,
     WorkerId,
 };
-pub use model::{JobModel, ModelFacts, ModelTensor, ModelTrial, ModelVerdict};
+pub use model::{JobModel, ModelFacts, ModelRecord, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::Pool;
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};

@@ -34,6 +34,14 @@ pub struct ModelFacts {
     pub trial: ModelTrial,
 }
 
+/// A network as jobs and manifests record it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ModelRecord {
+    pub name: String,
+    /// SHA-256 of the concatenated ONNX files.
+    pub sha256: String,
+}
+
 /// The outcome of the check of a network, as the checking process reports it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

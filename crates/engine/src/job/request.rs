@@ -5,7 +5,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::algorithm::Algorithm;
 use super::ids::{CalibrationId, MeasurementId, ModelId};
-use super::model::{JobModel, ModelChoice};
+use super::model::{JobModel, ModelChoice, ModelRecord};
 use super::registration::{Registered, RegistrationRequest};
 use super::report::Finding;
 use super::shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};
@@ -157,6 +157,9 @@ pub struct JobSpec {
     pub algorithm: Algorithm,
     /// The network of [`Algorithm::Learned`]; `None` for other algorithms.
     pub model: Option<JobModel>,
+    /// The networks of the schedule at the submission.
+    #[serde(default)]
+    pub networks: Vec<ModelRecord>,
     /// The schedule. It has no stages for [`Algorithm::Learned`].
     pub schedule: Schedule,
     pub tile: TileSpec,
@@ -243,6 +246,7 @@ impl JobRequest {
             run,
             algorithm,
             model,
+            networks: Vec::new(),
             schedule,
             tile,
             registration: self.registration,

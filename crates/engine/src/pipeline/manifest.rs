@@ -9,11 +9,11 @@ use ndarray::{Array2, Axis};
 use serde::{Serialize, Serializer};
 
 use super::assessment::{BLOCK, Expected, TileAssessment, expected};
-use super::networks::ModelRecord;
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, TileRecord};
 use crate::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
-    MeasurementId, Mosaic, Registered, ResultFile, SceneShape, Schedule, Sha256, TaskKind,
+    MeasurementId, ModelRecord, Mosaic, Registered, ResultFile, SceneShape, Schedule, Sha256,
+    TaskKind,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -388,7 +388,11 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
 }
 
 #[cfg(test)]
+use reconstruction::priors::onnx::Device;
+
+#[cfg(test)]
 pub(super) fn sample(frames: usize) -> Manifest {
+    let source = super::networks::NetworkSource::new(None, Device::Cpu);
     let hash = Sha256::of(b"");
     let recipe = Recipe {
         program_version: VERSION,
@@ -403,7 +407,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
             measurement_sha256: hash,
             measurement_axes: Some("frame-row-column".to_owned()),
         },
-        models: ModelRecord::of(&Algorithm::PnpTvFastdvdnet.default_schedule()),
+        models: source.records(&Algorithm::PnpTvFastdvdnet.default_schedule()),
         scale: ScaleRecord {
             masks_full_scale: 1.0,
             measurement_full_scale: 255.0,

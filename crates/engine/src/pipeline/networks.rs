@@ -7,10 +7,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 
 use ndarray::Array3;
-use serde::{Deserialize, Serialize};
 use sha2::Digest;
 
-use crate::job::{JobSpec, Label, Schedule, Sha256};
+use crate::job::{JobSpec, Label, ModelRecord, Schedule, Sha256};
 use reconstruction::ReconError;
 use reconstruction::cores::Cores;
 use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
@@ -64,33 +63,14 @@ const FFDNET_GRAY: Model = Model {
     files: &[("model.onnx", include_bytes!("../../../../models/ffdnet-gray/model.onnx"))],
 };
 
-/// A network as manifests record it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct ModelRecord {
-    pub name: String,
-    /// SHA-256 of the concatenated ONNX files.
-    pub sha256: String,
-}
-
 impl ModelRecord {
-    /// The record of an embedded network.
-    pub fn carried(network: Network) -> Self {
-        let model = carried(network);
-        Self::new(&model, model.files.iter().map(|(_, content)| *content))
-    }
-
-    /// The records of the embedded networks of a schedule, in a fixed order.
-    pub fn of(schedule: &Schedule) -> Vec<Self> {
-        schedule.networks().into_iter().map(Self::carried).collect()
-    }
-
     /// The records of all networks of a job: those of its schedule, or its model.
     pub fn for_job(spec: &JobSpec) -> Vec<Self> {
         let model = spec.model.as_ref().map(|model| Self {
             name: model.name.as_ref().map_or("learned", Label::as_str).to_owned(),
             sha256: model.sha256.to_string(),
         });
-        Self::of(&spec.schedule).into_iter().chain(model).collect()
+        spec.networks.iter().cloned().chain(model).collect()
     }
 
     /// The record of a model whose files have these contents.
@@ -163,6 +143,15 @@ pub enum NetworkError {
     #[error("the model file {} can't be read: {reason}", path.display())]
     Model { path: PathBuf, reason: io::Error },
     #[error(
+        "the folder {} has none of the networks {}", .0.display(), Network::ALL.map(|which| carried(which).name).join(", ")
+    )]
+    NoModels(PathBuf),
+    #[error(
+        "the networks of this worker differ from those at the submission of the job ({0}): start the service and its \
+         workers with the same --models, or submit the job again"
+    )]
+    Changed(String),
+    #[error(
         "the file of the network is damaged: its SHA-256 is {actual}, but should be {expected}"
     )]
     Damaged { expected: Sha256, actual: Sha256 },
@@ -187,7 +176,8 @@ pub enum NetworkError {
 #[derive(Debug, Clone)]
 pub struct NetworkSource {
     library: Option<PathBuf>,
-    models: Option<PathBuf>,
+    /// Networks that replace the embedded ones: the contents of their files, in order.
+    replaced: Arc<Vec<(Network, Vec<Vec<u8>>)>>,
     device: Device,
     version: Arc<OnceLock<String>>,
     #[cfg(feature = "gpu")]
@@ -199,7 +189,7 @@ impl NetworkSource {
     pub fn new(library: Option<PathBuf>, device: Device) -> Self {
         Self {
             library,
-            models: None,
+            replaced: Arc::default(),
             device,
             version: Arc::default(),
             #[cfg(feature = "gpu")]
@@ -207,24 +197,67 @@ impl NetworkSource {
         }
     }
 
-    /// Uses the networks in `folder`, which is organised like `models/`, instead of the embedded ones.
-    pub fn with_models(self, folder: Option<PathBuf>) -> Self {
-        Self { models: folder, ..self }
-    }
-
-    /// The records of the networks that a schedule uses.
-    pub fn records(&self, schedule: &Schedule) -> Result<Vec<ModelRecord>, NetworkError> {
-        let record = |network| {
-            let contents = self.contents(network)?;
-            Ok(ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref)))
+    /// Replaces the embedded networks by those in `folder`, which is organised like `models/`. The files are read at once, so
+    /// that later changes of the folder have no effect. An empty path counts as none.
+    ///
+    /// # Errors
+    /// [`NetworkError::NoModels`]: the folder has none of the networks. [`NetworkError::Model`]: a file can't be read.
+    pub fn with_models(self, folder: Option<&Path>) -> Result<Self, NetworkError> {
+        let Some(folder) = folder.filter(|folder| !folder.as_os_str().is_empty()) else {
+            return Ok(self);
         };
-        schedule.networks().into_iter().map(record).collect()
+        let found =
+            Network::ALL.into_iter().filter(|which| folder.join(carried(*which).name).is_dir());
+        let contents = |which| {
+            let Model { name, files } = carried(which);
+            let files = files.iter().map(|(file, _)| read(&folder.join(name).join(file)));
+            Ok((which, files.collect::<Result<_, NetworkError>>()?))
+        };
+        let replaced: Vec<_> = found.map(contents).collect::<Result<_, NetworkError>>()?;
+        if replaced.is_empty() {
+            return Err(NetworkError::NoModels(folder.to_owned()));
+        }
+        Ok(Self { replaced: replaced.into(), ..self })
     }
 
-    /// A schedule with the precision of networks that suits this device.
+    /// True if a folder's network replaces one of the schedule.
+    pub fn replaces(&self, schedule: &Schedule) -> bool {
+        schedule.networks().into_iter().any(|network| self.replacement(network).is_some())
+    }
+
+    fn replacement(&self, network: Network) -> Option<&[Vec<u8>]> {
+        let files = self.replaced.iter().find(|(which, _)| *which == network);
+        files.map(|(_, files)| files.as_slice())
+    }
+
+    /// The record of a network.
+    pub fn record(&self, network: Network) -> ModelRecord {
+        let contents = self.contents(network);
+        ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref))
+    }
+
+    /// The records of the networks that a schedule uses, in a fixed order.
+    pub fn records(&self, schedule: &Schedule) -> Vec<ModelRecord> {
+        schedule.networks().into_iter().map(|network| self.record(network)).collect()
+    }
+
+    /// Checks that the networks of a schedule are those that were recorded for its job.
+    ///
+    /// # Errors
+    /// [`NetworkError::Changed`] with the name of a network that differs.
+    pub fn check(&self, schedule: &Schedule, recorded: &[ModelRecord]) -> Result<(), NetworkError> {
+        let changed = self.records(schedule).into_iter().find(|record| !recorded.contains(record));
+        changed.map_or(Ok(()), |record| Err(NetworkError::Changed(record.name)))
+    }
+
+    /// A schedule with the precision of networks that suits this device. A folder's FastDVDNet without an 8-bit version runs
+    /// with its 32-bit weights.
     #[must_use]
     pub fn suited(&self, schedule: Schedule) -> Schedule {
-        if self.device == Device::Cpu { schedule } else { schedule.with_float_networks() }
+        let only_float = self.replacement(Network::FastDvdNet).is_some()
+            && self.replacement(Network::FastDvdNetInt8).is_none();
+        let keeps = self.device == Device::Cpu && !only_float;
+        if keeps { schedule } else { schedule.with_float_networks() }
     }
 
     /// The device for a network. GPUs have no operators for 8 bits, and results must not depend on the worker.
@@ -233,13 +266,11 @@ impl NetworkSource {
     }
 
     /// The contents of the files of a network, in order.
-    fn contents(&self, network: Network) -> Result<Vec<Cow<'static, [u8]>>, NetworkError> {
-        let Model { name, files } = carried(network);
-        let content = |&(file, embedded): &(&str, &'static [u8])| match &self.models {
-            None => Ok(Cow::Borrowed(embedded)),
-            Some(folder) => read(&folder.join(name).join(file)).map(Cow::Owned),
-        };
-        files.iter().map(content).collect()
+    fn contents(&self, network: Network) -> Vec<Cow<'static, [u8]>> {
+        match self.replacement(network) {
+            Some(files) => files.iter().map(|file| Cow::Owned(file.clone())).collect(),
+            None => carried(network).files.iter().map(|(_, file)| Cow::Borrowed(*file)).collect(),
+        }
     }
 
     /// Name of the execution provider of the networks of a schedule, for records: that of the GPU if any runs there. A schedule
@@ -352,7 +383,7 @@ impl NetworkSource {
     fn load(&self, network: Network, cores: &Cores) -> Result<ClipDenoiser, NetworkError> {
         let runtime = Runtime::open(&self.path()?, self.device_for(network))?;
         let runtime = runtime.with_cores(cores.clone());
-        Ok(ClipDenoiser::load(&runtime, network, self.contents(network)?)?)
+        Ok(ClipDenoiser::load(&runtime, network, self.contents(network))?)
     }
 
     /// Loads the encoder with a separate session for these cores.
@@ -550,7 +581,7 @@ mod tests {
         let algorithm = Algorithm::PnpTvFastdvdnet;
         for device in [Device::Cpu, Device::Gpu, Device::Cuda(0)] {
             let source = NetworkSource::new(None, device);
-            let name = |schedule| source.records(&schedule).unwrap().remove(0).name;
+            let name = |schedule| source.records(&schedule).remove(0).name;
             let (quick, exact) =
                 (algorithm.default_schedule(), algorithm.default_schedule().with_float_networks());
             assert_eq!(source.provider(&quick), "CPUExecutionProvider");
@@ -564,20 +595,44 @@ mod tests {
     fn networks_of_a_folder_replace_the_embedded_ones_and_are_recorded() {
         let carried = NetworkSource::new(None, Device::Cpu);
         let folder = tempfile::tempdir().unwrap();
-        let custom = carried.clone().with_models(Some(folder.path().into()));
+        let custom = || carried.clone().with_models(Some(folder.path()));
         let schedule = Algorithm::PnpFfdnet.default_schedule();
-        let error = custom.records(&schedule).unwrap_err().to_string();
-        assert!(error.contains("ffdnet-gray/model.onnx"), "{error}");
+        let error = custom().unwrap_err().to_string();
+        assert!(error.contains("none of the networks fastdvdnet-gray"), "{error}");
 
         let file = folder.path().join("ffdnet-gray/model.onnx");
         std::fs::create_dir(file.parent().unwrap()).unwrap();
+        let error = custom().unwrap_err().to_string();
+        assert!(error.contains("ffdnet-gray/model.onnx"), "{error}");
         let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/ffdnet-gray/model.onnx");
         let mut content = std::fs::read(shipped).unwrap();
         std::fs::write(&file, &content).unwrap();
-        assert_eq!(custom.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
+        assert_eq!(custom().unwrap().records(&schedule), carried.records(&schedule));
         content.push(0);
         std::fs::write(&file, &content).unwrap();
-        assert_ne!(custom.records(&schedule).unwrap(), carried.records(&schedule).unwrap());
+        let custom = custom().unwrap();
+        assert_ne!(custom.records(&schedule), carried.records(&schedule));
+        assert!(custom.replaces(&schedule) && !carried.replaces(&schedule));
+        custom.check(&schedule, &custom.records(&schedule)).unwrap();
+        let error = custom.check(&schedule, &carried.records(&schedule)).unwrap_err().to_string();
+        assert!(error.contains("(ffdnet-gray)"), "{error}");
+        let default = Algorithm::PnpTvFastdvdnet.default_schedule();
+        assert!(!custom.replaces(&default));
+        assert_eq!(custom.suited(default.clone()), default);
+    }
+
+    #[test]
+    fn a_network_without_an_8_bit_version_runs_in_32_bits() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("fastdvdnet-gray")).unwrap();
+        for file in ["stage1.onnx", "stage2.onnx"] {
+            std::fs::write(folder.path().join("fastdvdnet-gray").join(file), file).unwrap();
+        }
+        let source =
+            NetworkSource::new(None, Device::Cpu).with_models(Some(folder.path())).unwrap();
+        let schedule = source.suited(Algorithm::PnpTvFastdvdnet.default_schedule());
+        assert_eq!(schedule, Algorithm::PnpTvFastdvdnet.default_schedule().with_float_networks());
+        assert!(source.replaces(&schedule));
     }
 
     #[test]

@@ -4,8 +4,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::transport::TileTask;
+use engine::job::ModelRecord;
 use engine::job::{JobId, Sha256, TaskId, TaskProgress, WorkerId};
-use engine::pipeline::networks::ModelRecord;
+use engine::pipeline::networks::NetworkSource;
 use reconstruction::priors::Network;
 
 /// A tile to be computed.
@@ -169,14 +170,14 @@ pub enum HelloAnswer {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Program {
     pub version: String,
-    /// The networks that the program carries.
+    /// The networks that it runs.
     pub models: Vec<ModelRecord>,
 }
 
 impl Program {
-    /// This program; `version` includes the commit.
-    pub fn of(version: &str) -> Self {
-        let models = Network::ALL.map(ModelRecord::carried).to_vec();
+    /// This program with networks from `source`; `version` includes the commit.
+    pub fn of(version: &str, source: &NetworkSource) -> Self {
+        let models = Network::ALL.map(|network| source.record(network)).to_vec();
         Self { version: version.into(), models }
     }
 
@@ -196,7 +197,7 @@ impl Program {
         let differs = names.into_iter().find(|name| hash(self, name) != hash(other, name))?;
         Some(format!(
             "both are version {}, but the worker's network {differs} has the hash {}, the \
-             server's {}: install the same build",
+             server's {}: install the same build, and start both with the same --models",
             self.version,
             hash(other, differs),
             hash(self, differs)
@@ -207,10 +208,12 @@ impl Program {
 #[cfg(test)]
 mod tests {
     use super::Program;
+    use engine::pipeline::networks::NetworkSource;
+    use reconstruction::priors::onnx::Device;
 
     #[test]
     fn a_refusal_names_both_versions_or_both_networks() {
-        let this = Program::of("0.1.0 (c51e2c3)");
+        let this = Program::of("0.1.0 (c51e2c3)", &NetworkSource::new(None, Device::Cpu));
         assert_eq!(this.refusal(&this), None);
         for version in ["0.0.9", "0.1.0 (e45ec33)", "0.1.0"] {
             let other = Program { version: version.into(), ..this.clone() };
