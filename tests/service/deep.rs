@@ -85,7 +85,7 @@ async fn a_folder_of_networks_replaces_the_embedded_ones_in_jobs() {
         "snapshots": 0,
         "schedule": {"stages": [
             {"prior": "tv", "iterations": 5, "tv_weight": 0.1},
-            {"prior": "fastdvdnet-int8", "iterations": 1, "sigma": 0.1},
+            {"prior": "fastdvdnet-int8", "iterations": 1, "sigma": [0.1, 0.1]},
         ]},
     });
     let job = app.submit(&body).await;
