@@ -6,12 +6,29 @@ pub mod config;
 pub mod http;
 mod webhooks;
 
-/// A builder of HTTP clients that trust the certificates of the system, or those of `SSL_CERT_FILE`.
+/// A builder of HTTP clients that trust the certificates of the system, or those of `SSL_CERT_FILE` and `SSL_CERT_DIR`.
 ///
 /// A system without certificates is no error: addresses with `http://` need none.
-pub fn http_client() -> reqwest::ClientBuilder {
+///
+/// # Errors
+/// One of the variables is set, but there is no certificate in its place.
+pub fn http_client() -> Result<reqwest::ClientBuilder, String> {
+    let found = rustls_native_certs::load_native_certs();
+    let stated = ["SSL_CERT_FILE", "SSL_CERT_DIR"].into_iter().find_map(|variable| {
+        let place = std::env::var_os(variable).filter(|place| !place.is_empty())?;
+        Some(format!("{variable} names {}, which has no certificate in PEM form", place.display()))
+    });
+    if let Some(stated) = stated.filter(|_| found.certs.is_empty()) {
+        let reasons: Vec<String> = found.errors.iter().map(ToString::to_string).collect();
+        let reasons = if reasons.is_empty() {
+            reasons.concat()
+        } else {
+            format!(" ({})", reasons.join("; "))
+        };
+        return Err(format!("{stated}{reasons}: correct the variable, or unset it"));
+    }
     let mut trusted = rustls::RootCertStore::empty();
-    trusted.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
+    trusted.add_parsable_certificates(found.certs);
     let tls = rustls::ClientConfig::builder().with_root_certificates(trusted).with_no_client_auth();
-    reqwest::Client::builder().tls_backend_preconfigured(tls)
+    Ok(reqwest::Client::builder().tls_backend_preconfigured(tls))
 }

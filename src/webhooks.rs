@@ -42,7 +42,10 @@ const PAUSES: [Duration; 9] = [
 /// Sends notifications until it is dropped. `allowed` are the hosts that the administrator allows.
 pub async fn send(store: Store, allowed: Vec<String>) {
     // A redirection could lead to a host that is not allowed.
-    let client = crate::http_client().timeout(TIMEOUT).redirect(Policy::none()).build();
+    let client = crate::http_client().and_then(|client| {
+        let client = client.timeout(TIMEOUT).redirect(Policy::none()).build();
+        client.map_err(|error| error.to_string())
+    });
     let client = match client {
         Ok(client) => client,
         Err(error) => {

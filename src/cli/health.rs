@@ -48,8 +48,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
 async fn ask(address: SocketAddr) -> Result<String> {
     let broken = |error: reqwest::Error| CliError::Failure(format!("no answer: {error}"));
     let url = format!("http://{}/readyz", reachable(address));
-    let client = crate::http_client().timeout(PATIENCE).no_proxy().build();
-    let answer = client.map_err(broken)?.get(url).send().await.map_err(broken)?;
+    let client = crate::http_client().map_err(CliError::Failure)?.timeout(PATIENCE).no_proxy();
+    let answer = client.build().map_err(broken)?.get(url).send().await.map_err(broken)?;
     let is_ready = answer.status().is_success();
     let text = answer.text().await.map_err(broken)?;
     if is_ready { Ok(text) } else { Err(CliError::Failure(text)) }

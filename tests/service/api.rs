@@ -190,7 +190,7 @@ async fn proxied(app: &TestApp) -> String {
 async fn references_hold_below_a_prefix() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let base = proxied(&app).await;
-    let http = sci_recon::http_client().pool_max_idle_per_host(0).build().unwrap();
+    let http = sci_recon::http_client().unwrap().pool_max_idle_per_host(0).build().unwrap();
     let follow = |response: &Response, header: &str| {
         let place = response.headers()[header].to_str().unwrap();
         response.url().join(place).unwrap()

@@ -142,7 +142,8 @@ impl TestApp {
         let data = folder.path().join(subfolder);
         let (arguments, token) = (owned(arguments), std::sync::RwLock::default());
         // A server that stops answering fails the test.
-        let client = sci_recon::http_client().read_timeout(LONGEST_SILENCE).build().unwrap();
+        let client =
+            sci_recon::http_client().unwrap().read_timeout(LONGEST_SILENCE).build().unwrap();
         Self { _folder: folder, data, process, url, client, arguments, token }
     }
 

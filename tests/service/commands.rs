@@ -231,6 +231,22 @@ fn tls_server() -> (String, String) {
     (url, certified.cert.pem())
 }
 
+/// Starts a server that answers every request with a redirection. Returns its address.
+fn redirecting_server(place: &'static str) -> String {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    std::thread::spawn(move || {
+        for mut socket in listener.incoming().flatten() {
+            let _ = socket.read(&mut [0; 4096]);
+            let answer = format!(
+                "HTTP/1.1 308 Permanent Redirect\r\nLocation: {place}\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+            );
+            socket.write_all(answer.as_bytes()).unwrap();
+        }
+    });
+    url
+}
+
 #[tokio::test]
 async fn permanent_failures_end_a_command_at_once_and_others_are_retried() {
     let (url, certificate) = tls_server();
@@ -253,6 +269,18 @@ async fn permanent_failures_end_a_command_at_once_and_others_are_retried() {
     command.args(["ls", "--url", &url]).env("SSL_CERT_FILE", lab.path("authority.pem"));
     let output = command.output().await.unwrap();
     assert!(String::from_utf8_lossy(&output.stderr).contains("404"), "{output:?}");
+    // A variable that names no certificate is refused by its name.
+    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    command.args(["ls", "--url", &url]).env("SSL_CERT_FILE", lab.path("lost.pem"));
+    let output = command.output().await.unwrap();
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{text}");
+    assert!(text.contains("SSL_CERT_FILE names") && text.contains("lost.pem"), "{text}");
+    // A redirection to another place would lose the token.
+    let moved = redirecting_server("https://lab.example/sci/v1/jobs");
+    let refused = lab.refused(2, &["ls", "--url", &moved]).await;
+    assert!(refused.contains("redirects to https://lab.example/sci"), "{refused}");
+    assert!(refused.contains("--url"), "{refused}");
     // A service that is down may come back.
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));

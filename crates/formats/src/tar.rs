@@ -20,11 +20,16 @@ const MAX_MEMBERS: usize = 16_384;
 const MAX_NAME_BYTES: u64 = 1 << 16;
 
 /// Returns all members that are regular files. Errors: a damaged header; members outside the file, or of one
-/// name; links, devices and sparse files.
+/// name; links, devices and sparse files; an archive without its end.
 pub(super) fn members(file: &File, length: u64) -> Result<Vec<Member>> {
     let (mut offset, mut members, mut count) = (0, Vec::new(), 0);
     let mut long_name = None;
-    while offset + BLOCK <= length {
+    loop {
+        if offset + BLOCK > length {
+            // Members may be missing, and a frame would be lost in silence.
+            let problem = "the archive is cut short: it has no block of zeros at its end; copy or pack it again";
+            return Err(malformed(problem));
+        }
         let head = read(file, offset, BLOCK)?;
         if head.iter().all(|byte| *byte == 0) {
             break;

@@ -12,6 +12,8 @@ use std::time::Duration;
 
 use clap::Args;
 use rand::RngExt;
+use reqwest::header::LOCATION;
+use reqwest::redirect::Policy;
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde_json::Value;
 
@@ -115,6 +117,9 @@ impl Client {
             return Err(wrong(&"it must begin with http:// or https://"));
         }
         let http = crate::http_client()
+            .map_err(CliError::Input)?
+            // A token is not sent to another place, and the API redirects nothing.
+            .redirect(Policy::none())
             .connect_timeout(Duration::from_secs(10))
             .tcp_keepalive(Duration::from_secs(30))
             // The check of a large file takes minutes.
@@ -141,11 +146,25 @@ impl Client {
             self.has_answered.fetch_or(sent.is_ok(), Ordering::Relaxed);
             let error = match sent {
                 Ok(response) if response.status().is_success() => return Ok(response),
+                Ok(response) if response.status().is_redirection() => self.moved(&response),
                 Ok(response) => refusal(response).await,
                 Err(error) => self.interruption(&error),
             };
             wait_to_retry(error, &mut attempt).await?;
         }
+    }
+
+    /// The error of a redirection, with the address to state instead.
+    fn moved(&self, response: &Response) -> ClientError {
+        let place = response.headers().get(LOCATION).and_then(|place| place.to_str().ok());
+        let place = place.and_then(|place| response.url().join(place).ok()).map(|place| {
+            let place = place.to_string();
+            let path = response.url().as_str().strip_prefix(&self.url).unwrap_or_default();
+            place.strip_suffix(path).unwrap_or(&place).to_owned()
+        });
+        let place = place.as_deref().unwrap_or("another place");
+        let text = format!("{} redirects to {place}: give that address as --url", self.url);
+        ClientError::Unreachable(text)
     }
 
     fn interruption(&self, error: &reqwest::Error) -> ClientError {

@@ -598,7 +598,7 @@ mod tests {
         let custom = || carried.clone().with_models(Some(folder.path()));
         let schedule = Algorithm::PnpFfdnet.default_schedule();
         let error = custom().unwrap_err().to_string();
-        assert!(error.contains("none of the networks fastdvdnet-gray"), "{error}");
+        assert!(error.contains("none of the networks ffdnet-gray"), "{error}");
 
         let file = folder.path().join("ffdnet-gray/model.onnx");
         std::fs::create_dir(file.parent().unwrap()).unwrap();

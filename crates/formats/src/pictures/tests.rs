@@ -130,7 +130,13 @@ fn tar_lengths_and_checksums_are_verified() {
     let mut wrong = whole.clone();
     wrong[0] = b'b';
     assert_names(&refusal(&wrong), &["header at byte 0 is damaged"]);
-    assert_names(&refusal(&whole[..530]), &["cut short"]);
+    // Cut in a member, before one, in its header, and before the end.
+    let second = whole.len() - 1024 - (512 + png.len().next_multiple_of(512));
+    for length in [530, second, second + 100, second + 511, whole.len() - 1024, whole.len() - 1000]
+    {
+        let refused = refusal(&whole[..length]);
+        assert_names(&refused, &["cut short"]);
+    }
     // Long names are stored in separate members; folders are skipped.
     let long = format!("{}/a7.png", "folder".repeat(40));
     let pax = format!("{} path={long}\n", long.len() + 10);
@@ -139,6 +145,7 @@ fn tar_lengths_and_checksums_are_verified() {
             tar_member("folder", b'5', b""),
             tar_member("name", kind, name.as_bytes()),
             tar_member("cut", b'0', &png),
+            vec![0; 1024],
         ]
         .concat();
         assert_eq!(read(&bytes).unwrap().0.frames, 1);
