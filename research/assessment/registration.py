@@ -1,14 +1,14 @@
 """Test whether masks that moved since their calibration are found and corrected, and whether others are left alone.
 
     python registration.py run SCI_RECON_BINARY --data DATA --out FOLDER [--cases 40] [--first 0] [--algorithm gap-tv]
-           [--side 128] [--rotation 0.3] [--growth 0.3] [--only-drift]
+           [--side 128] [--rotation 0.3] [--growth 0.3] [--only-motion]
     python registration.py report --out FOLDER [--markdown]
 
 DATA has photographs in photos/train and photos/val. A camera moves over them behind masks of four kinds, Cr 8 to 20, with
 noise of 0 to 10. A pixel of a mask is the mean of the light on its area. So masks are simulated on five times as many
 pixels, moved by whole ones of these, and averaged; `--motion spline` moves the masks by cubic splines instead. With
 `--rotation` and `--growth` the fine light is also turned and magnified about the centre. Errors of a motion are root mean
-squares of the displacement over the picture. Each case
+squares of the displacement over the picture. `--only-motion` estimates the drift alone, without PSNR. Each case
 is reconstructed with the masks of the calibration, registered ones and the true ones. Right masks and flipped ones must be
 left alone. PSNR leaves out the border, for which moved masks are unknown. `run` appends a line to a file in FOLDER for this
 binary: an interrupted run continues where it stopped. The last line of a report is JSON.
@@ -110,12 +110,14 @@ class Bench(Runs):
             return
         case = Case(self.a, self.files, index)
         runs = {}
-        for drift, true in (('drift', case.moved), ('none', case.calibrated))[:1 if self.a.only_drift else 2]:
+        for drift, true in (('drift', case.moved), ('none', case.calibrated))[:1 if self.a.only_motion else 2]:
             y = (true * case.frames).sum(0) + case.noise
             arms = [('calibrated', case.calibrated, 'off'), ('registered', case.calibrated, 'auto')]
             arms += [('true', true, 'off')] if drift == 'drift' else []
             if drift == 'none':
                 arms += [('flipped', case.calibrated[:, :, ::-1], 'off'), ('flipped_registered', case.calibrated[:, :, ::-1], 'auto')]
+            if self.a.only_motion:
+                arms = arms[1:2]
             runs[drift] = {name: self.reconstruct(masks, y, case.frames, option) for name, masks, option in arms}
         self.keep({'case': index} | case.about() | runs)
 
@@ -126,7 +128,7 @@ class Bench(Runs):
                 np.save(folder / f'{name}.npy', array.astype(np.float32))
             done = subprocess.run([self.a.binary, 'reconstruct', '--masks', folder / 'masks.npy', '--measurement', folder / 'measurement.npy', '--truth', folder / 'truth.npy',
                                    '--truth-full-scale', '1', '--measurement-full-scale', str(1 / len(masks)), '--algorithm', self.a.algorithm, '--registration', option,
-                                   '--threads', '1', '--json', '--out', folder / 'out'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+                                   *(['--iterations', '2'] if self.a.only_motion else []), '--threads', '1', '--json', '--out', folder / 'out'], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             if done.returncode not in (0, 3):
                 sys.exit(f'a reconstruction failed: {done.stderr}')
             report, manifest = json.loads(done.stdout), json.loads((folder / 'out/manifest.json').read_text())
@@ -172,12 +174,13 @@ def median(values):
 def summary(rows):
     errors = [error(row) for row in rows]
     applied = [(row, error) for row, error in zip(rows, errors) if error is not None]
-    psnr = lambda name: median([row['drift'][name]['psnr_db'] for row in rows])
+    complete = [row for row in rows if 'true' in row['drift']]
+    psnr = lambda name: median([row['drift'][name]['psnr_db'] for row in complete])
     return {'cases': len(rows), 'applied': len(applied), 'within_limit': sum(error <= limit(row) for row, error in applied),
             'within_0_05': sum(error <= .05 for _, error in applied), 'within_0_1': sum(error <= .1 for _, error in applied),
             'calibrated_db': psnr('calibrated'), 'registered_db': psnr('registered'), 'true_db': psnr('true'),
-            'lost_to_true_db': median([gain(row['drift'], 'true', 'registered') for row, _ in applied]),
-            'made_worse': sum(gain(row[drift]) < -WORSE for row in rows for drift in ('drift', 'none') if drift in row)
+            'lost_to_true_db': median([gain(row['drift'], 'true', 'registered') for row, _ in applied if 'true' in row['drift']]),
+            'made_worse': sum(gain(row[drift]) < -WORSE for row in complete for drift in ('drift', 'none') if drift in row)
                           + sum(gain(row['none'], 'flipped_registered', 'flipped') < -WORSE for row in rows if 'none' in row),
             'false_corrections': [sum(row['none'][arm]['registration']['applied'] for row in rows if 'none' in row) for arm in ('registered', 'flipped_registered')]}
 
@@ -189,7 +192,7 @@ def report(a):
     if not a.markdown:
         for row in rows:
             found, off = row['drift']['registered']['registration'], error(row)
-            psnr = ' '.join(f'{row["drift"][name]["psnr_db"]:.2f}' for name in ('calibrated', 'registered', 'true'))
+            psnr = ' '.join(f'{row["drift"][name]["psnr_db"]:.2f}' for name in ('calibrated', 'registered', 'true') if name in row['drift'])
             print(f'{row["case"]:3} {row["kind"]:15} Cr {row["ratio"]:2} sigma {row["sigma"]:g} motion {motion(row)} found {motion(found)} '
                   f'{"not applied" if off is None else f"off by {off:.3f}"}{"" if off is None or off <= limit(row) else " !"} dB {psnr} {(found["reason"] or "")[:40]}', end='')
             if 'none' in row:
@@ -203,10 +206,12 @@ def report(a):
     for kind, one in table.items():
         print(f'| {kind} | {one["applied"]} of {one["cases"]} | {one["within_limit"]} | {one["within_0_05"]}, {one["within_0_1"]} | {one["calibrated_db"]}, {one["registered_db"]}, {one["true_db"]}'
               f' | {one["lost_to_true_db"]} | {", ".join(map(str, one["false_corrections"]))} | {one["made_worse"]} |')
-    cost = [row[drift]['registered']['cpu_s'] - row[drift]['calibrated']['cpu_s'] for row in rows for drift in ('drift', 'none') if drift in row]
-    per_frame = [seconds / row['ratio'] for seconds, row in zip(cost, [row for row in rows for drift in ('drift', 'none') if drift in row])]
+    complete = [row for row in rows if 'true' in row['drift']]
+    runs = [(row['ratio'], row[drift]) for row in complete for drift in ('drift', 'none') if drift in row]
+    cost = [(ratio, arms['registered']['cpu_s'] - arms['calibrated']['cpu_s']) for ratio, arms in runs]
+    cpu = {'cpu_s_per_frame': median([seconds / ratio for ratio, seconds in cost]), 'largest_cpu_s': round(max(seconds for _, seconds in cost), 2)} if cost else {}
     print()
-    print(json.dumps(table | {'cpu_s_per_frame': median(per_frame), 'largest_cpu_s': round(max(cost), 2)}))
+    print(json.dumps(table | cpu))
 
 
 def main():
@@ -222,7 +227,7 @@ def main():
     runs.add_argument('--side', type=int, default=128, help='side of the images in pixels')
     runs.add_argument('--rotation', type=float, default=0, help='largest rotation in degrees')
     runs.add_argument('--growth', type=float, default=0, help='largest change of the magnification in percent')
-    runs.add_argument('--only-drift', action='store_true', help='leave out masks that have not moved, and flipped ones')
+    runs.add_argument('--only-motion', action='store_true', help='estimate the motion of moved masks alone, without PSNR')
     runs.add_argument('--parallel', type=int, default=os.cpu_count(), help='reconstructions at the same time')
     for command in (runs, commands.add_parser('report')):
         command.add_argument('--out', required=True, help='the folder of the results')
