@@ -33,9 +33,11 @@ pub enum Free {
     All,
 }
 
-/// Errors at the hold-out pixels of a piece for 3x3 displacements, which differ from a motion by up to one step along each
-/// axis.
+/// Errors at the hold-out pixels of a piece for 3x3 displacements, which differ from a motion and the displacement `centre`
+/// by up to one step along each axis.
 pub struct Grid {
+    /// Displacement in pixels along rows and columns.
+    pub centre: [f64; 2],
     /// Row and column of each pixel on the sensor.
     pub places: Vec<[f64; 2]>,
     /// Squared errors of all pixels at each displacement, in row order.
@@ -54,7 +56,7 @@ pub struct Fit {
 
 impl Fit {
     /// Fits errors on grids around a motion `centre`, with displacements `step` pixels apart, on a sensor \[H,W\]. The
-    /// minimum lies within the grid.
+    /// minimum lies within the grids.
     pub fn new(
         (centre, sensor): (Similarity, [usize; 2]),
         grids: &[Grid],
@@ -67,7 +69,11 @@ impl Fit {
         });
         let quadratics: Vec<_> = pixels
             .map(|(grid, pixel, place)| {
-                Quadratic::fit(|at| grid.errors[at][pixel], frame.derivatives(*place, free))
+                Quadratic::fit(
+                    |at| grid.errors[at][pixel],
+                    frame.derivatives(*place, free),
+                    grid.centre.map(|at| at / step),
+                )
             })
             .collect();
         let mut sum = Quadratic::default();
@@ -82,7 +88,9 @@ impl Fit {
             return Self { minimum, uncertainty, has_settled: false, has_turned: false };
         };
         let lowest = product(&inverse, sum.gradient).map(|value| -value);
-        let offset = lowest.map(|value| value.clamp(-1.0, 1.0));
+        let centres = grids.iter().flat_map(|grid| grid.centre);
+        let reach = 1.0 + centres.fold(0.0, |most: f64, at| most.max(at.abs())) / step;
+        let offset = lowest.map(|value| value.clamp(-reach, reach));
         let mut variance = [0.0; COUNT];
         // Variances of rotation and growth, and their covariance.
         let mut turned = [0.0; 3];
@@ -188,7 +196,7 @@ mod tests {
             };
             places.iter().enumerate().map(error).collect()
         };
-        Grid { errors: (0..9).map(errors).collect(), places }
+        Grid { centre: [0.0; 2], errors: (0..9).map(errors).collect(), places }
     }
 
     #[test]

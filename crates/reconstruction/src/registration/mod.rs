@@ -41,6 +41,8 @@ const SHARE: f64 = 0.1;
 const ITERATIONS: (usize, usize) = (8, 24);
 /// Distances in pixels between the displacements of the first grids of the refinement.
 const STEPS: [f64; 2] = [0.5, 0.25];
+/// Largest number of grids of the first of these distances on a piece beside the first one.
+const MAX_COARSE_GRIDS: usize = 2;
 /// Distances in pixels between the displacements of the last grids: each grid is repeated until it has settled.
 const LAST_STEPS: [f64; 3] = [0.125, 0.0625, 0.03125];
 /// Largest number of these grids.
@@ -107,10 +109,16 @@ pub fn register<E: From<ReconError>>(
     let [coarse, fine] = STEPS;
     let Some(grids) = search.grids(best, coarse)? else { return Ok(None) };
     best.motion = search.fit(best, &grids, coarse, Free::Shift).minimum;
-    let Some(grids) = search.grids(best, fine)? else { return Ok(None) };
+    let Some(grid) = search.grid(0, best, fine)? else { return Ok(None) };
+    let grids = [grid];
     let turned = search.fit(best, &grids, fine, Free::All);
+    let centre = best.motion.shift;
     best.motion = search.fit(best, &grids, fine, Free::Shift).minimum;
-    if let Some(found) = search.similarity(best, turned, read)? {
+    let motion = if turned.has_turned { turned.minimum } else { best.motion };
+    let correction = Correction { motion, ..best };
+    let [grid] = grids;
+    let start = Start { correction, has_turned: turned.has_turned, centre, grid };
+    if let Some(found) = search.similarity(start, read)? {
         return Ok(Some(found));
     }
     search.pieces.truncate(1);
@@ -231,6 +239,17 @@ impl Piece {
     }
 }
 
+/// What the first piece alone gives.
+struct Start {
+    correction: Correction,
+    /// True if its rotation and growth are significant.
+    has_turned: bool,
+    /// The errors of the piece on a fine grid.
+    grid: Grid,
+    /// The shift at the centre of this grid.
+    centre: [f64; 2],
+}
+
 struct Search<'a> {
     plan: &'a Plan,
     /// The first piece of the plan, and others.
@@ -244,7 +263,7 @@ struct Search<'a> {
 impl<'a> Search<'a> {
     fn new(plan: &'a Plan, first: Piece, proceed: &'a mut dyn FnMut(f64) -> bool) -> Self {
         let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
-        let others = plan.others.first().map_or(0, |others| 9 * others.len());
+        let others = plan.others.first().map_or(0, |others| 2 * 9 * others.len());
         let total = (2 * plan.reach() + 1).pow(2) * ITERATIONS.0 + (runs + others) * ITERATIONS.1;
         Self { plan, pieces: vec![first], proceed, done: 0.0, total: total as f64 }
     }
@@ -313,23 +332,17 @@ impl<'a> Search<'a> {
         Ok(best.1)
     }
 
-    /// Estimates rotation and growth too, after the first piece has given a shift and, `turned`, all parameters. `None` if
-    /// they are not significant, or if they predict other pixels no better than a shift.
+    /// Estimates rotation and growth too. `None` if they are not significant, or if they predict other pixels no better than
+    /// a shift.
     fn similarity<E: From<ReconError>>(
         &mut self,
-        shifted: Correction,
-        turned: Fit,
+        Start { correction: mut best, mut has_turned, centre, grid }: Start,
         read: impl Fn(&Place) -> Result<Piece, E>,
     ) -> Result<Option<Registration>, E> {
         let fine = STEPS[1];
-        let mut best = if turned.has_turned {
-            Correction { motion: turned.minimum, ..shifted }
-        } else {
-            shifted
-        };
-        let mut has_turned = turned.has_turned;
         let plan = self.plan;
-        for (index, places) in plan.others.iter().enumerate() {
+        let mut first = Some(grid);
+        for places in &plan.others {
             self.pieces.truncate(1);
             for place in places {
                 self.pieces.push(read(place)?);
@@ -337,11 +350,28 @@ impl<'a> Search<'a> {
             if self.pieces.len() == 1 {
                 break;
             }
-            let Some(grids) = self.grids(best, fine)? else { return Ok(None) };
+            let grid = match first.take() {
+                Some(grid) => {
+                    let shift = best.motion.shift;
+                    let centre = [centre[0] - shift[0], centre[1] - shift[1]];
+                    Grid { centre, ..grid }
+                }
+                None => {
+                    let Some(grid) = self.grid(0, best, fine)? else { return Ok(None) };
+                    grid
+                }
+            };
+            let mut grids = vec![grid];
+            while grids.len() < self.pieces.len() {
+                match self.local_grid(grids.len(), best)? {
+                    Some(grid) => grids.push(grid),
+                    None => drop(self.pieces.remove(grids.len())),
+                }
+            }
             let fit = self.fit(best, &grids, fine, Free::All);
             has_turned |= fit.has_turned;
-            // The first step decides: if neighbours do not turn, farther pieces are not read.
-            if index == 0 && !has_turned {
+            // If neighbours do not turn, farther pieces are not read.
+            if !has_turned {
                 return Ok(None);
             }
             best.motion = fit.minimum;
@@ -360,6 +390,23 @@ impl<'a> Search<'a> {
         let errors = (self.deciding_errors(shifted)?, self.deciding_errors(best)?);
         let (Some(shifted), Some(turned)) = errors else { return Ok(None) };
         Ok((t_statistic(&shifted, &turned) >= SIGNIFICANT).then_some(found))
+    }
+
+    /// The errors of a piece on a fine grid around a displacement that fits it alone. `None` if it has no light.
+    fn local_grid(&mut self, piece: usize, best: Correction) -> Result<Option<Grid>> {
+        let [coarse, fine] = STEPS;
+        let mut local = best;
+        for _ in 0..MAX_COARSE_GRIDS {
+            let Some(grid) = self.grid(piece, local, coarse)? else { return Ok(None) };
+            let fit = self.fit(local, &[grid], coarse, Free::Shift);
+            local.motion = fit.minimum;
+            if fit.has_settled {
+                break;
+            }
+        }
+        let [row, column] = [0, 1].map(|axis| local.motion.shift[axis] - best.motion.shift[axis]);
+        let grid = self.grid(piece, local, fine)?;
+        Ok(grid.map(|grid| Grid { centre: [row, column], ..grid }))
     }
 
     /// Fits ever finer grids until each has settled. `None` if a reconstruction diverges.
@@ -433,7 +480,7 @@ impl<'a> Search<'a> {
             }
         }
         let places = self.pieces[piece].places(self.plan.margin).collect();
-        Ok(Some(Grid { places, errors: grid }))
+        Ok(Some(Grid { centre: [0.0; 2], places, errors: grid }))
     }
 
     fn fit(&self, best: Correction, grids: &[Grid], step: f64, free: Free) -> Fit {

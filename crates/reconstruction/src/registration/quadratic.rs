@@ -11,9 +11,9 @@ pub struct Quadratic {
 }
 
 impl Quadratic {
-    /// The least-squares fit to values in row order on a grid of 3x3 displacements from -1 to 1. `motion` is the derivative of
-    /// the displacement along rows and columns by each parameter.
-    pub fn fit(value: impl Fn(usize) -> f64, motion: [[f64; COUNT]; 2]) -> Self {
+    /// The least-squares fit to values in row order on a grid of 3x3 displacements from -1 to 1 around `centre`. `motion` is
+    /// the derivative of the displacement along rows and columns by each parameter.
+    pub fn fit(value: impl Fn(usize) -> f64, motion: [[f64; COUNT]; 2], centre: [f64; 2]) -> Self {
         let sum = |weight: &dyn Fn(f64, f64) -> f64| {
             let place = |place: usize| ((place / 3) as f64 - 1.0, (place % 3) as f64 - 1.0);
             (0..9).map(|at| weight(place(at).0, place(at).1) * value(at)).sum::<f64>()
@@ -24,6 +24,8 @@ impl Quadratic {
             [sum(&|row, _| row * row - 2.0 / 3.0), both],
             [both, sum(&|_, column| column * column - 2.0 / 3.0)],
         ];
+        let slope =
+            [0, 1].map(|axis| slope[axis] - bend[axis][0] * centre[0] - bend[axis][1] * centre[1]);
         let mut fitted = Self::default();
         for (one, gradient) in fitted.gradient.iter_mut().enumerate() {
             *gradient = slope[0] * motion[0][one] + slope[1] * motion[1][one];
@@ -104,15 +106,15 @@ mod tests {
         ];
         let minimum = [0.3, -0.2, 0.1, 0.05];
         let mut sum = Quadratic::default();
-        for motion in motions {
+        for (motion, centre) in motions.into_iter().zip([[0.0, 0.0], [0.5, -0.3]]) {
             let at = motion
                 .map(|axis: [f64; 4]| axis.iter().zip(minimum).map(|(a, b)| a * b).sum::<f64>());
             let value = |place: usize| {
-                let (row, column) =
-                    ((place / 3) as f64 - 1.0 - at[0], (place % 3) as f64 - 1.0 - at[1]);
+                let row = (place / 3) as f64 - 1.0 + centre[0] - at[0];
+                let column = (place % 3) as f64 - 1.0 + centre[1] - at[1];
                 3.0 * row * row + column * column + 0.5 * row * column
             };
-            sum.add(&Quadratic::fit(value, motion));
+            sum.add(&Quadratic::fit(value, motion, centre));
         }
         let found = product(&sum.inverse().unwrap(), sum.gradient).map(|value| -value);
         assert!(
@@ -120,7 +122,7 @@ mod tests {
             "{found:?}"
         );
         assert!(sum.gradient_at(minimum).iter().all(|value| value.abs() < 1e-9));
-        let hill = Quadratic::fit(|place| -((place as f64 - 4.0).powi(2)), motions[0]);
+        let hill = Quadratic::fit(|place| -((place as f64 - 4.0).powi(2)), motions[0], [0.0; 2]);
         assert!(hill.inverse().is_none());
     }
 }
