@@ -41,7 +41,7 @@ const SHARE: f64 = 0.1;
 const ITERATIONS: (usize, usize) = (8, 24);
 /// Distances in pixels between the displacements of the first grids of the refinement.
 const STEPS: [f64; 2] = [0.5, 0.25];
-/// Largest number of grids of the first of these distances on a piece beside the first one.
+/// Largest number of grids at the first of these distances on each further piece.
 const MAX_COARSE_GRIDS: usize = 2;
 /// Distances in pixels between the displacements of the last grids: each grid is repeated until it has settled.
 const LAST_STEPS: [f64; 3] = [0.125, 0.0625, 0.03125];
@@ -239,7 +239,7 @@ impl Piece {
     }
 }
 
-/// What the first piece alone gives.
+/// The estimate from the first piece alone.
 struct Start {
     correction: Correction,
     /// True if its rotation and growth are significant.
