@@ -179,12 +179,17 @@ eval-wrong-inputs: evaluation-data $(TRAINING)/.stamp runtime ## test whether th
 		--data $(DATA) --out eval-output/wrong-inputs --algorithm $(ALGORITHM) --good $(GOOD) --scenes $(WRONG)
 GOOD ?= 60
 WRONG ?= 20
-eval-registration: evaluation-data $(TRAINING)/.stamp runtime ## test whether moved masks are found and corrected; ALGORITHM=gap-tv CASES=40
+eval-registration: evaluation-data $(TRAINING)/.stamp runtime ## test whether moved masks are found and corrected; ALGORITHM=gap-tv CASES=40 SIDE=128 ROTATION=0 GROWTH=0
 	@$(CARGO) build --release --quiet
 	@ORT_DYLIB_PATH=$${ORT_DYLIB_PATH:-$(abspath runtime)/libonnxruntime.so} \
 		$(TRAINING)/bin/python research/assessment/registration.py run $${CARGO_TARGET_DIR:-target}/release/sci-recon \
-		--data $(DATA) --out eval-output/registration --algorithm $(ALGORITHM) --cases $(CASES) --first $(FIRST)
+		--data $(DATA) --out eval-output/registration --algorithm $(ALGORITHM) --cases $(CASES) --first $(FIRST) \
+		--side $(SIDE) --rotation $(ROTATION) --growth $(GROWTH)
 CASES ?= 40
+SIDE ?= 128
+# Largest rotation in degrees, and largest change of the magnification in percent.
+ROTATION ?= 0
+GROWTH ?= 0
 # The first scene of the judges; those before it served the tuning.
 FIRST ?= 590
 

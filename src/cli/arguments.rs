@@ -18,6 +18,7 @@ use engine::pipeline::NetworkSource;
 use formats::{Axes, Crop, Packing};
 use optics::MAX_BANDS;
 use reconstruction::priors::onnx::Device;
+use reconstruction::registration::Similarity;
 use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
 use strum::{VariantArray, VariantNames};
@@ -202,16 +203,26 @@ impl ScheduleArguments {
     }
 }
 
-/// A registration: `off`, `auto`, or a shift `ROWS,COLUMNS` in pixels.
+/// A registration: `off`, `auto`, or a motion `ROWS,COLUMNS[,DEGREES[,SCALE]]`.
 pub(super) fn registration(text: &str) -> Result<RegistrationRequest, String> {
-    let wrong = || format!("{text:?}; give off, auto, or ROWS,COLUMNS in pixels, such as 0.5,-1.2");
+    let wrong = || {
+        format!(
+            "{text:?}; give off, auto, or ROWS,COLUMNS[,DEGREES[,SCALE]], such as 0.5,-1.2 for a shift in pixels"
+        )
+    };
     let request = match text {
         "off" => return Ok(RegistrationRequest::Off),
         "auto" => return Ok(RegistrationRequest::Auto),
-        shift => {
-            let (rows, columns) = shift.split_once(',').ok_or_else(wrong)?;
-            let pixels = |text: &str| text.trim().parse::<f64>().map_err(|_| wrong());
-            RegistrationRequest::Shift([pixels(rows)?, pixels(columns)?])
+        motion => {
+            let numbers: Result<Vec<f64>, _> =
+                motion.split(',').map(|number| number.trim().parse()).collect();
+            let (rows, columns, rotation, scale) = match numbers.map_err(|_| wrong())?[..] {
+                [rows, columns] => (rows, columns, 0.0, 1.0),
+                [rows, columns, rotation] => (rows, columns, rotation, 1.0),
+                [rows, columns, rotation, scale] => (rows, columns, rotation, scale),
+                _ => return Err(wrong()),
+            };
+            RegistrationRequest::Stated(Similarity { shift: [rows, columns], rotation, scale })
         }
     };
     request.error(false).map_or(Ok(request), |error| Err(error.detail))

@@ -92,8 +92,8 @@ pub struct Arguments {
     /// The order of the axes in the truth's file.
     #[arg(long, value_name = "ORDER", value_parser = named::<Axes>())]
     truth_axes: Option<Axes>,
-    /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
-    /// it in pixels.
+    /// Masks that have moved since the calibration: off, auto to estimate and correct the motion, or
+    /// ROWS,COLUMNS[,DEGREES[,SCALE]] to state the shift in pixels, a clockwise rotation and a factor.
     #[arg(long, value_name = "WHICH", default_value = "auto", value_parser = registration, allow_hyphen_values = true)]
     registration: RegistrationRequest,
     #[command(flatten)]

@@ -83,8 +83,8 @@ pub(super) struct SubmissionArguments {
     /// Least overlap of neighbouring tiles in pixels.
     #[arg(long, value_name = "PIXELS", requires = "tile", help_heading = JOB)]
     overlap: Option<u32>,
-    /// Masks that have moved since the calibration: off, auto to estimate and correct the shift, or ROWS,COLUMNS to state
-    /// it in pixels [default: auto].
+    /// Masks that have moved since the calibration: off, auto to estimate and correct the motion, or
+    /// ROWS,COLUMNS[,DEGREES[,SCALE]] to state the shift in pixels, a clockwise rotation and a factor [default: auto].
     #[arg(long, value_name = "WHICH", value_parser = registration, allow_hyphen_values = true, help_heading = JOB)]
     registration: Option<RegistrationRequest>,
     /// From -100 to 100; jobs of higher priority are served first.
@@ -338,7 +338,7 @@ mod tests {
             ("snapshots", "0-3"),
             ("tile", "128"),
             ("overlap", "16"),
-            ("registration", "-0.5,2"),
+            ("registration", "-0.5,2,0.1,1.001"),
             ("priority", "-3"),
             ("truth", "t.npy"),
             ("label", "milk"),
@@ -368,7 +368,10 @@ mod tests {
         // The measurement names the calibration.
         assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
         assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));
-        assert_eq!(job["registration"], serde_json::json!({"shift": [-0.5, 2.0]}));
+        assert_eq!(
+            job["registration"],
+            serde_json::json!({"shift": [-0.5, 2.0], "rotation": 0.1, "scale": 1.001})
+        );
     }
 
     #[test]

@@ -69,7 +69,7 @@ async function everything() {
   await checks.step("moved", () => moved(page, checks));
   const known = await checks.step("stated", () => stated(page, checks, drifting, small));
   const { registration } = await service.call("GET", `/v1/jobs/${known}`);
-  checks.that(JSON.stringify(registration) === '{"shift":[2,-1]}', `the job has the stated shift: ${JSON.stringify(registration)}`);
+  checks.that(JSON.stringify(registration) === '{"shift":[2,-1],"rotation":0,"scale":1}', `the job has the stated shift: ${JSON.stringify(registration)}`);
   await checks.step("phone", () => phone(browser, checks, service.url, id));
   await checks.step("loading", () => loading(browser, checks, service.url));
   await checks.step("reference", () => reference(browser, checks, service.url));

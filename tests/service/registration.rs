@@ -8,30 +8,57 @@ use crate::samples::{Scene, npy};
 
 const SCENE: Scene = Scene { frames: 4, height: 104, width: 112, snapshots: 1 };
 
-/// A mask's pixel as the area of a pattern that has moved down and to the right by quarters of a pixel.
-fn mask(frame: usize, row: usize, column: usize, quarters: [usize; 2]) -> f32 {
+/// A motion of masks: pixels down and to the right, degrees clockwise and a factor about the centre.
+#[derive(Clone, Copy)]
+struct Motion {
+    shift: [f64; 2],
+    rotation: f64,
+    scale: f64,
+}
+
+const UNMOVED: Motion = Motion { shift: [0.0; 2], rotation: 0.0, scale: 1.0 };
+const SHIFTED: Motion = Motion { shift: [1.5, 0.75], ..UNMOVED };
+
+impl Motion {
+    /// The place in the unmoved pattern of a place in a picture.
+    fn source(self, scene: Scene, [row, column]: [f64; 2]) -> [f64; 2] {
+        let (sine, cosine) = self.rotation.to_radians().sin_cos();
+        let centre = [scene.height, scene.width].map(|side| (side as f64 - 1.0) / 2.0);
+        let [row, column] = [row - centre[0] - self.shift[0], column - centre[1] - self.shift[1]];
+        [
+            centre[0] + (cosine * row - sine * column) / self.scale,
+            centre[1] + (cosine * column + sine * row) / self.scale,
+        ]
+    }
+}
+
+/// A mask's pixel as the area of a pattern that has moved, on a grid of quarters of a pixel.
+fn mask(scene: Scene, frame: usize, row: usize, column: usize, motion: Motion) -> f32 {
     let cells = (0..16).map(|cell| {
-        let (row, column) = (4 * row + 32 + cell / 4, 4 * column + 32 + cell % 4);
-        SCENE.mask(frame, (row - quarters[0]) / 4, (column - quarters[1]) / 4)
+        let quarter = |cell: usize| (cell as f64 + 0.5) / 4.0 - 0.5;
+        let place = [row as f64 + quarter(cell / 4), column as f64 + quarter(cell % 4)];
+        let [row, column] = motion.source(scene, place).map(|at| (at + 8.5) as usize);
+        scene.mask(frame, row, column)
     });
     cells.sum::<f32>() / 16.0
 }
 
 /// The calibrated masks [B,H,W].
-fn masks() -> Vec<u8> {
-    let Scene { frames, height, width, .. } = SCENE;
+fn masks(scene: Scene) -> Vec<u8> {
+    let Scene { frames, height, width, .. } = scene;
     let places =
         (0..frames * height * width).map(|at| (at / width / height, at / width, at % width));
-    let values = places.map(|(k, line, column)| mask(k, line % height, column, [0, 0]));
+    let values = places.map(|(k, line, column)| mask(scene, k, line % height, column, UNMOVED));
     npy(&[frames, height, width], values)
 }
 
 /// A snapshot [H,W] behind masks that have moved.
-fn snapshot(quarters: [usize; 2]) -> Vec<u8> {
-    let Scene { frames, height, width, .. } = SCENE;
+fn snapshot(scene: Scene, motion: Motion) -> Vec<u8> {
+    let Scene { frames, height, width, .. } = scene;
     let value = |at: usize| {
         let (row, column) = (at / width, at % width);
-        (0..frames).map(|k| mask(k, row, column, quarters) * SCENE.pixel(0, k, row, column)).sum()
+        let light = |k| mask(scene, k, row, column, motion) * scene.pixel(0, k, row, column);
+        (0..frames).map(light).sum()
     };
     npy(&[height, width], (0..height * width).map(value))
 }
@@ -63,8 +90,8 @@ fn has_moved_masks(job: &Value) -> bool {
 #[tokio::test]
 async fn moved_masks_are_corrected_and_reported() {
     let app = TestApp::with(&["--workers", "2"]).await;
-    let calibration = id(&app.calibrate(masks()).await.expect(201));
-    let moved = id(&app.measure(&calibration, snapshot([6, 3])).await.expect(201));
+    let calibration = id(&app.calibrate(masks(SCENE)).await.expect(201));
+    let moved = id(&app.measure(&calibration, snapshot(SCENE, SHIFTED)).await.expect(201));
     let (off, uncorrected) = run(&app, &moved, &json!("off")).await;
     assert!(off["registered"].is_null() && !has_moved_masks(&off), "{off:#}");
     let (auto, corrected) = run(&app, &moved, &json!("auto")).await;
@@ -96,18 +123,52 @@ async fn moved_masks_are_corrected_and_reported() {
     let manifest = app.get(&path).await.expect(200).json();
     assert_eq!(manifest["content"]["registration"], *registered);
 
-    let far =
-        json!({"measurement": moved, "algorithm": "gap-tv", "registration": {"shift": [9, 0]}});
-    let refused = app.post("/v1/jobs", &far).await;
-    refused.problem(422, "invalid_request");
-    assert_eq!(refused.json()["errors"][0]["pointer"], "/registration/shift");
+    for (registration, pointer) in [
+        (json!({"shift": [9, 0]}), "/registration/shift"),
+        (json!({"rotation": 1}), "/registration/rotation"),
+        (json!({"scale": 1.1}), "/registration/scale"),
+        (json!({"angle": 0.1}), "/registration/angle"),
+        (json!("on"), "/registration"),
+    ] {
+        let wrong =
+            json!({"measurement": moved, "algorithm": "gap-tv", "registration": registration});
+        let refused = app.post("/v1/jobs", &wrong).await;
+        refused.problem(422, "invalid_request");
+        assert_eq!(refused.json()["errors"][0]["pointer"], pointer, "{refused:?}");
+    }
+}
+
+#[tokio::test]
+async fn masks_that_have_turned_and_grown_are_corrected() {
+    const WIDE: Scene = Scene { frames: 4, height: 184, width: 180, snapshots: 1 };
+    let motion = Motion { shift: [0.75, -0.5], rotation: 0.25, scale: 1.002 };
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let calibration = id(&app.calibrate(masks(WIDE)).await.expect(201));
+    let moved = id(&app.measure(&calibration, snapshot(WIDE, motion)).await.expect(201));
+    let (auto, found) = run(&app, &moved, &json!("auto")).await;
+    let registered = &auto["registered"];
+    assert!(registered["applied"] == true && has_moved_masks(&auto), "{auto:#}");
+    let number = |name: &str| registered[name].as_f64().unwrap();
+    assert!((number("rotation") - 0.25).abs() < 0.05, "{registered:#}");
+    assert!((number("scale") - 1.002).abs() < 0.0008, "{registered:#}");
+    let detail = finding(&auto, "moved_masks").unwrap()["detail"].as_str().unwrap().to_owned();
+    assert!(detail.contains("degrees (clockwise)"), "{detail}");
+    let all = json!({"shift": motion.shift, "rotation": motion.rotation, "scale": motion.scale});
+    let (job, stated) = run(&app, &moved, &all).await;
+    assert_eq!(job["registration"], all, "{job:#}");
+    for name in ["shift", "rotation", "scale"] {
+        assert_eq!(job["registered"][name], all[name], "{job:#}");
+    }
+    let (_, shifted) = run(&app, &moved, &json!({"shift": motion.shift})).await;
+    let quality = [&shifted, &found, &stated].map(|file| psnr(WIDE, 0, &values(file)));
+    assert!(quality[1] > quality[0] + 1.0 && quality[2] > quality[0] + 1.0, "{quality:?}");
 }
 
 #[tokio::test]
 async fn corrected_masks_become_a_calibration() {
     let app = TestApp::with(&["--workers", "2"]).await;
-    let calibration = id(&app.calibrate(masks()).await.expect(201));
-    let moved = id(&app.measure(&calibration, snapshot([6, 3])).await.expect(201));
+    let calibration = id(&app.calibrate(masks(SCENE)).await.expect(201));
+    let moved = id(&app.measure(&calibration, snapshot(SCENE, SHIFTED)).await.expect(201));
     let (auto, corrected) = run(&app, &moved, &json!("auto")).await;
     let save = async |job: &Value| {
         let body = json!({"registration_of": job["id"], "name": "after the drift"});
@@ -126,7 +187,7 @@ async fn corrected_masks_become_a_calibration() {
     }
     // The saved masks fit the measurement, and serve it as well as the correction within the job.
     let saved = saved["id"].as_str().unwrap();
-    let again = id(&app.measure(saved, snapshot([6, 3])).await.expect(201));
+    let again = id(&app.measure(saved, snapshot(SCENE, SHIFTED)).await.expect(201));
     let (fits, frames) = run(&app, &again, &json!("auto")).await;
     assert!(fits["registered"]["applied"] == false && !has_moved_masks(&fits), "{fits:#}");
     let quality = [&corrected, &frames].map(|file| psnr(SCENE, 0, &values(file)));
@@ -157,8 +218,8 @@ async fn corrected_masks_become_a_calibration() {
 #[tokio::test]
 async fn masks_that_fit_are_used_unchanged() {
     let app = TestApp::with(&["--workers", "2"]).await;
-    let calibration = id(&app.calibrate(masks()).await.expect(201));
-    let measurement = id(&app.measure(&calibration, snapshot([0, 0])).await.expect(201));
+    let calibration = id(&app.calibrate(masks(SCENE)).await.expect(201));
+    let measurement = id(&app.measure(&calibration, snapshot(SCENE, UNMOVED)).await.expect(201));
     let (_, expected) = run(&app, &measurement, &json!("off")).await;
     let (auto, frames) = run(&app, &measurement, &json!("auto")).await;
     assert!(auto["registered"]["applied"] == false && !has_moved_masks(&auto), "{auto:#}");

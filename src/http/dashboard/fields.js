@@ -59,22 +59,26 @@ export function partFields(id, frames, changed, more = []) {
   return { element, value, set, setPacking };
 }
 
-const CORRECTIONS = [["", "corrected if it helps"], ["stated", "moved by a known shift"], ["off", "used as calibrated"]];
+const CORRECTIONS = [["", "corrected if it helps"], ["stated", "moved by a known motion"], ["off", "used as calibrated"]];
 
 /** Fields for masks that have moved since the calibration. `value()` has the setting as in a request; `changed()` is called after each edit. */
 export function shiftFields(changed) {
   const select = h("select", { id: "registration" }, CORRECTIONS.map(([value, text]) => h("option", { value }, text)));
   const shift = [numberField("shift-rows", "Masks moved down, in pixels"), numberField("shift-columns", "Masks moved right, in pixels")];
-  const arrange = () => shift.forEach(({ element }) => (element.hidden = select.value !== "stated"));
-  for (const input of [select, ...shift.map((one) => one.input)]) {
+  const rotation = numberField("rotation", "Masks turned clockwise, in degrees");
+  const scale = numberField("mask-scale", "Masks grown by the factor");
+  const stated = [...shift, rotation, scale];
+  const arrange = () => stated.forEach(({ element }) => (element.hidden = select.value !== "stated"));
+  for (const input of [select, ...stated.map((one) => one.input)]) {
     input.addEventListener("change", () => {
       arrange();
       changed();
     });
   }
   arrange();
-  const value = () => (select.value === "stated" ? { shift: shift.map((one) => one.value() ?? 0) } : select.value || null);
-  return { elements: [h("label", { for: "registration" }, "Masks that have moved are", select), shift.map((one) => one.element)], value };
+  const motion = () => ({ shift: shift.map((one) => one.value() ?? 0), ...given({ rotation: rotation.value(), scale: scale.value() }) });
+  const value = () => (select.value === "stated" ? motion() : select.value || null);
+  return { elements: [h("label", { for: "registration" }, "Masks that have moved are", select), stated.map((one) => one.element)], value };
 }
 
 const AXES = [["column", "to the right, along a row"], ["row", "downwards, along a column"]];

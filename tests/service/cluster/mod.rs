@@ -132,7 +132,7 @@ async fn a_job_on_remote_workers_gives_the_same_bytes() {
 async fn moved_masks_give_the_same_bytes_on_remote_workers() {
     fn moved(measurement: &str) -> Value {
         let mut job = with_iterations(measurement, 50);
-        job["registration"] = json!({"shift": [0.5, -1.25]});
+        job["registration"] = json!({"shift": [0.5, -1.25], "rotation": 0.2, "scale": 0.998});
         job
     }
     let Some(nats) = Nats::start(1) else { return };

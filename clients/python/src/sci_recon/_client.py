@@ -105,7 +105,7 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
-        registration: str | Mapping[str, Sequence[float]] | None = None,
+        registration: str | Mapping[str, float | Sequence[float]] | None = None,
         priority: int = 0,
         truth: Source | None = None,
         label: str | None = None,
@@ -292,7 +292,7 @@ class Client:
         schedule: Mapping[str, Any] | None = None,
         tile: Mapping[str, int] | None = None,
         model: str | None = None,
-        registration: str | Mapping[str, Sequence[float]] | None = None,
+        registration: str | Mapping[str, float | Sequence[float]] | None = None,
         priority: int = 0,
         truth: Source | None = None,
         label: str | None = None,
@@ -302,8 +302,8 @@ class Client:
         """Submits a job without waiting for it.
 
         `snapshots` is "all", an index from 0, or (first, last), both included. `registration` "auto", the default,
-        corrects masks that have moved since the calibration; {"shift": (rows, columns)} states the shift in pixels, and
-        "off" uses the calibrated masks. `truth` [B, H, W] has the true frames, if they are known: the dashboard shows PSNR
+        corrects masks that have moved since the calibration; {"shift": (rows, columns), "rotation": degrees, "scale":
+        factor} states the motion about the centre of the sensor, rotations clockwise; "off" uses the calibrated masks. `truth` [B, H, W] has the true frames, if they are known: the dashboard shows PSNR
         and SSIM against them. A repeated request with the same `key` returns the job of the first one. The service notifies
         `webhook`, an address, when the job ends.
         """

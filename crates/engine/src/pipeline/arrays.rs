@@ -12,7 +12,7 @@ use super::tile::TileInput;
 use crate::job::Sha256;
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
-use reconstruction::registration::{Correction, Interpolated, MARGIN, covers};
+use reconstruction::registration::{Correction, Interpolated};
 use reconstruction::tile::Window;
 
 /// The files of the masks \[B,H,W\] on \[0,1\] and of the snapshots \[S,H,W\], divided by their full scale.
@@ -60,7 +60,8 @@ impl Arrays {
         let mean = (light / frames).insert_axis(Axis(0));
         let (_, height, width) = mean.dim();
         let moved = Interpolated::new(mean.view(), correction.interpolation);
-        let moved = moved.window(correction.shift, 0..height, 0..width).remove_axis(Axis(0));
+        let source = correction.motion.source([height, width], [0; 2]);
+        let moved = moved.window(&source, 0..height, 0..width).remove_axis(Axis(0));
         Ok(moved.mapv_into(|mean| frames * known(mean)))
     }
 
@@ -98,7 +99,7 @@ pub fn window(
 }
 
 /// Reads a window of all masks after a correction. NaN are unknown. It depends on the masks within
-/// [`MARGIN`] pixels only.
+/// the margin of the motion only.
 pub fn mask_window(
     masks: &Reader,
     place: &Window,
@@ -114,18 +115,20 @@ pub fn mask_window(
 pub(super) fn moved_window<E>(
     (height, width): (usize, usize),
     place: &Window,
-    Correction { shift, interpolation }: Correction,
+    Correction { motion, interpolation }: Correction,
     read: impl FnOnce(&Window) -> Result<Array3<f32>, E>,
 ) -> Result<Array3<f32>, E> {
+    let margin = motion.margin([height, width], &place.rows, &place.columns);
     let around = |range: &Range<usize>, length: usize| {
-        range.start.saturating_sub(MARGIN)..length.min(range.end + MARGIN)
+        range.start.saturating_sub(margin)..length.min(range.end + margin)
     };
     let (rows, columns) = (around(&place.rows, height), around(&place.columns, width));
     let within = |range: &Range<usize>, start: usize| range.start - start..range.end - start;
     let inner = (within(&place.rows, rows.start), within(&place.columns, columns.start));
+    let source = motion.source([height, width], [rows.start, columns.start]);
     let wide = Window { rows, columns, step: 1 };
     let masks = read(&wide)?;
-    let moved = Interpolated::new(masks.view(), interpolation).window(shift, inner.0, inner.1);
+    let moved = Interpolated::new(masks.view(), interpolation).window(&source, inner.0, inner.1);
     let step = place.step.cast_signed();
     Ok(moved.slice(s![.., ..;step, ..;step]).to_owned())
 }
@@ -138,11 +141,11 @@ pub fn snapshot_window(
     correction: Option<Correction>,
 ) -> Result<Array3<f32>, FormatError> {
     let mut y = window(snapshots, range, place)?;
-    let Some(Correction { shift, .. }) = correction else { return Ok(y) };
-    let (height, width) = (snapshots.info().height, snapshots.info().width);
+    let Some(Correction { motion, .. }) = correction else { return Ok(y) };
+    let sensor = [snapshots.info().height, snapshots.info().width];
     for ((_, row, column), value) in y.indexed_iter_mut() {
-        let at = (place.rows.start + row * place.step, place.columns.start + column * place.step);
-        if !(covers(at.0, shift[0], height) && covers(at.1, shift[1], width)) {
+        let at = [place.rows.start + row * place.step, place.columns.start + column * place.step];
+        if !motion.covers(sensor, at) {
             *value = f32::NAN;
         }
     }

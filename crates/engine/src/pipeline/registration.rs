@@ -14,7 +14,7 @@ use formats::planar::{self, Reader};
 use formats::validate::MaskStatistics;
 use formats::{FormatError, Limits, StackInfo};
 use reconstruction::ReconError;
-use reconstruction::registration::{self, Correction, Interpolation};
+use reconstruction::registration::{self, Correction, Interpolation, Plan};
 use reconstruction::tile::Window;
 
 /// Reason for sensors with colours. The planes of a mosaic sample the masks at every second pixel only.
@@ -58,22 +58,16 @@ fn estimate(
     masks: impl Fn(&Window) -> Result<Array3<f32>>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Registered> {
-    let Some((rows, columns)) = registration::choose(light, y) else {
-        return Ok(match request {
-            RegistrationRequest::Shift(shift) => {
-                let interpolation = Interpolation::default();
-                Registered::stated(Correction { shift, interpolation })
-            }
-            _ => Registered::skipped(SMALL),
-        });
-    };
-    let piece = masks(&Window { rows: rows.clone(), columns: columns.clone(), step: 1 })?;
-    let y = y.slice(s![rows, columns]);
-    if let RegistrationRequest::Shift(shift) = request {
-        let interpolation = registration::interpolation(piece.view(), y, shift, proceed)?;
-        return Ok(Registered::stated(Correction { shift, interpolation }));
+    let plan = Plan::choose(light, y);
+    if let RegistrationRequest::Stated(motion) = request {
+        let interpolation = match plan {
+            Some(plan) => registration::interpolation(&plan, y, motion, masks, proceed)?,
+            None => Interpolation::default(),
+        };
+        return Ok(Registered::stated(Correction { motion, interpolation }));
     }
-    let found = registration::register(piece.view(), y, proceed)?;
+    let Some(plan) = plan else { return Ok(Registered::skipped(SMALL)) };
+    let found = registration::register(&plan, y, masks, proceed)?;
     Ok(found.map_or_else(|| Registered::skipped(DARK), Registered::from))
 }
 
@@ -117,7 +111,7 @@ fn without_estimate(request: RegistrationRequest, is_coloured: bool) -> Option<O
     }
 }
 
-/// Registers the masks of a job by its first snapshot. It reads one piece of fixed size of all masks.
+/// Registers the masks of a job by its first snapshot. It reads a few pieces of fixed size of all masks.
 ///
 /// Errors: those of reading and of the solver; a stop by the monitor.
 pub fn register_stored(
@@ -141,8 +135,9 @@ pub fn register_stored(
 /// Masks \[B,H,W\] in memory after a correction, with NaN where their value is unknown.
 pub fn moved(masks: ArrayView3<'_, f32>, correction: Correction) -> Array3<f32> {
     let (_, height, width) = masks.dim();
+    let source = correction.motion.source([height, width], [0; 2]);
     registration::Interpolated::new(masks, correction.interpolation).window(
-        correction.shift,
+        &source,
         0..height,
         0..width,
     )

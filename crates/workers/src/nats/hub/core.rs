@@ -13,7 +13,7 @@ use crate::nats::message::{Input, Notice, Program};
 use crate::nats::names;
 use crate::transport::TileTask;
 use engine::job::{JobId, Pool, Sha256, TaskId, WorkerId};
-use reconstruction::registration::Interpolation;
+use reconstruction::registration::{Correction, Interpolation, Similarity};
 use reconstruction::tile::Tile;
 use store::Store;
 
@@ -41,15 +41,17 @@ pub struct Undelivered {
 #[derive(PartialEq, Eq, Hash)]
 struct MaskWindow {
     masks: Sha256,
-    /// The bits of the shift, and the interpolation.
-    correction: Option<([u64; 2], Interpolation)>,
+    /// The bits of the motion's parameters, and the interpolation.
+    correction: Option<([u64; 4], Interpolation)>,
     tile: Tile,
 }
 
 impl MaskWindow {
     fn of(task: &TileTask) -> Self {
-        let correction =
-            task.correction.map(|moved| (moved.shift.map(f64::to_bits), moved.interpolation));
+        let correction = task.correction.map(|Correction { motion, interpolation }| {
+            let Similarity { shift: [rows, columns], rotation, scale } = motion;
+            ([rows, columns, rotation, scale].map(f64::to_bits), interpolation)
+        });
         Self { masks: task.masks, correction, tile: task.tile }
     }
 }
