@@ -119,6 +119,14 @@ async fn moved_masks_are_corrected_and_reported() {
     let (_, stated) = run(&app, &moved, &json!({"shift": [1.5, 0.75]})).await;
     let quality = [&uncorrected, &corrected, &stated].map(|file| psnr(SCENE, 0, &values(file)));
     assert!(quality[1] > quality[0] + 3.0 && quality[2] > quality[0] + 3.0, "{quality:?}");
+    // A stated motion is tested. One with wrong signs is an error, and one that does nothing leaves that of the check.
+    let (wrong, _) = run(&app, &moved, &json!({"shift": [-1.5, -0.75]})).await;
+    assert!(finding(&wrong, "misplaced_masks").is_some(), "{wrong:#}");
+    let (tiny, _) = run(&app, &moved, &json!({"shift": [1e-9, 0]})).await;
+    for job in [&wrong, &tiny] {
+        assert!(seen(job, &job["warnings"]), "{job:#}");
+        assert_eq!(job["assessment"]["grade"], "bad", "{job:#}");
+    }
     let path = format!("/v1/jobs/{}/exports/manifest", auto["id"].as_str().unwrap());
     let manifest = app.get(&path).await.expect(200).json();
     assert_eq!(manifest["content"]["registration"], *registered);

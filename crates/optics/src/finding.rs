@@ -194,7 +194,7 @@ findings! {
         "the job uses masks that are displaced from their calibrated position",
         "calibrate again once the optics are stable";
     MisplacedMasks: [Job], [Error],
-        "the moved masks explain no light in a large part of the picture",
+        "the moved masks explain less than before, or a large part of the light not at all",
         "check the shift stated as `registration`: pixels down, then pixels to the right; or estimate it with `registration` auto";
     TurnedMasks: [Measurement], [Error],
         "the masks fit when they are flipped or their rows and columns exchanged",

@@ -33,6 +33,7 @@ function reason(found) {
   if (!applied) return errors ? `No displacement lowers the error at hold-out pixels (${percent(before)}) significantly. The frames use the masks as they were calibrated.` : "The frames use the masks as they were calibrated.";
   const way = directions(found);
   if (!errors) return `The frames use masks that are displaced ${way}.`;
+  if (!found.uncertainty) return `The frames use masks that are displaced ${way}. The error at hold-out pixels is ${percent(before)} without this displacement and ${percent(after)} with it.`;
   return `The masks have moved ${way} since the calibration. The frames use the moved masks, which lowers the error at hold-out pixels from ${percent(before)} to ${percent(after)}. Calibrate again as soon as the optics are stable.`;
 }
 

@@ -18,6 +18,9 @@ use reconstruction::registration::{
 const NOT_CONVERGED: &str = "no shift by at most 4 pixels, also with a small rotation or magnification, makes the masks explain the \
      measurement well enough, so they were not moved";
 
+/// A stated motion explains the measurement better if it lowers the squared hold-out error to this share.
+const BETTER: f64 = 0.9;
+
 /// Share of the light without a mask from which moved masks are reported as misplaced.
 const MISPLACED: f64 = 0.25;
 
@@ -118,9 +121,9 @@ pub struct Registered {
     pub interpolation: Interpolation,
     /// Standard errors; null for a stated motion.
     pub uncertainty: Option<Uncertainty>,
-    /// Relative squared error at hold-out pixels with the calibrated masks; null for a stated motion.
+    /// Relative squared error at hold-out pixels with the calibrated masks; null if it is unknown.
     pub error_before: Option<f64>,
-    /// Relative squared error at these pixels with the moved masks; null for a stated motion.
+    /// Relative squared error at these pixels with the moved masks; null if it is unknown.
     pub error_after: Option<f64>,
     /// True if the job uses the moved masks. False if the calibrated masks fit, or if there is a `reason`.
     pub applied: bool,
@@ -132,12 +135,25 @@ pub struct Registered {
 }
 
 impl Registered {
-    /// The outcome of a motion that the request states.
-    pub fn stated(Correction { motion, interpolation }: Correction) -> Self {
+    /// The outcome of a motion that the request states, with the errors without and with it.
+    pub fn stated(
+        Correction { motion, interpolation }: Correction,
+        errors: Option<[f64; 2]>,
+    ) -> Self {
+        let (error_before, error_after) = (errors.map(|it| it[0]), errors.map(|it| it[1]));
         let Similarity { shift, rotation, scale } = motion;
         let applied = motion != Similarity::default();
         let skipped = Self::skipped("the motion was stated");
-        Self { shift, rotation, scale, interpolation, applied, ..skipped }
+        Self {
+            shift,
+            rotation,
+            scale,
+            interpolation,
+            applied,
+            error_before,
+            error_after,
+            ..skipped
+        }
     }
 
     /// The outcome where nothing was estimated.
@@ -169,12 +185,18 @@ impl Registered {
     pub fn superseded(&self) -> &'static [FindingCode] {
         const DRIFT: [FindingCode; 3] =
             [FindingCode::DriftedMasks, FindingCode::ShiftedMasks, FindingCode::ForeignMasks];
-        match (self.applied, self.error_after) {
-            (false, _) => &[],
-            (true, Some(_)) => &DRIFT,
-            // Nothing has tested a stated shift against masks of another camera.
-            (true, None) => &DRIFT[..2],
+        let is_estimate = self.uncertainty.is_some();
+        let explains_more = self.errors().is_none_or(|[before, after]| after < BETTER * before);
+        match (self.applied, is_estimate, explains_more) {
+            (true, true, _) => &DRIFT,
+            // Nothing has tested a stated motion against masks of another camera.
+            (true, false, true) => &DRIFT[..2],
+            (false, ..) | (true, false, false) => &[],
         }
+    }
+
+    fn errors(&self) -> Option<[f64; 2]> {
+        self.error_before.zip(self.error_after).map(|(before, after)| [before, after])
     }
 
     /// True if the white level follows the moved masks. Masks that see too little of the light give no white level, so that
@@ -186,20 +208,30 @@ impl Registered {
     /// The findings on masks that the job has moved.
     pub fn findings(&self) -> Vec<Finding> {
         let Some(Correction { motion, .. }) = self.correction() else { return Vec::new() };
-        let detail = match (self.error_before, self.error_after) {
-            (Some(before), Some(after)) => format!(
+        let errors = self.errors();
+        let detail = match errors.filter(|_| self.uncertainty.is_some()) {
+            Some([before, after]) => format!(
                 "the masks have moved by {} since the calibration; the job has corrected them, which lowers the hold-out \
                  error from {:.2} to {:.2} %",
                 described(motion, true),
                 100.0 * before.sqrt(),
                 100.0 * after.sqrt()
             ),
-            _ => format!(
+            None => format!(
                 "the job has moved the masks by {}, as its request states",
                 described(motion, false)
             ),
         };
         let mut findings = vec![Finding::new(FindingCode::MovedMasks, detail)];
+        if let Some([before, after]) = errors.filter(|[before, after]| after > before) {
+            let detail = format!(
+                "the stated motion raises the hold-out error from {:.2} to {:.2} %; check its signs (rows downwards, columns \
+                 to the right), or let the job estimate it with auto",
+                100.0 * before.sqrt(),
+                100.0 * after.sqrt()
+            );
+            findings.push(Finding::new(FindingCode::MisplacedMasks, detail));
+        }
         if let Some(lost) = self.lost_light.filter(|lost| *lost > MISPLACED) {
             let detail = format!(
                 "{:.0} % of the light of the first snapshot is at pixels where the masks are dark after they moved by \

@@ -60,11 +60,11 @@ fn estimate(
 ) -> Result<Registered> {
     let plan = Plan::choose(light, y);
     if let RegistrationRequest::Stated(motion) = request {
-        let interpolation = match plan {
-            Some(plan) => registration::interpolation(&plan, y, motion, masks, proceed)?,
-            None => Interpolation::default(),
+        let (interpolation, errors) = match plan {
+            Some(plan) => registration::known(&plan, y, motion, masks, proceed)?,
+            None => (Interpolation::default(), None),
         };
-        return Ok(Registered::stated(Correction { motion, interpolation }));
+        return Ok(Registered::stated(Correction { motion, interpolation }, errors));
     }
     let Some(plan) = plan else { return Ok(Registered::skipped(SMALL)) };
     let found = registration::register(&plan, y, masks, proceed)?;
@@ -162,7 +162,13 @@ pub fn correct(
     for (index, rows) in bands.iter().enumerate() {
         step(0.9 * index as f64 / bands.len() as f64, None)?;
         let place = Window { rows: rows.clone(), columns: 0..width, step: 1 };
-        let moved = mask_window(masks, &place, Some(correction))?;
+        let mut moved = mask_window(masks, &place, Some(correction))?;
+        // Pixels of the sensor that are not measured do not move with the masks.
+        moved.zip_mut_with(&mask_window(masks, &place, None)?, |moved, mask| {
+            if mask.is_nan() {
+                *moved = f32::NAN;
+            }
+        });
         let mut band = Array2::zeros((frames * BAND, width));
         for (mut part, mask) in band.axis_chunks_iter_mut(Axis(0), BAND).zip(moved.outer_iter()) {
             part.slice_mut(s![..rows.len(), ..]).assign(&mask);
@@ -187,4 +193,53 @@ pub fn correct(
         clipped_negative: 0,
         mean: light.sum() / (frames * height * width) as f64,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::correct;
+    use formats::Limits;
+    use formats::planar::{self, Reader};
+    use ndarray::{Array3, s};
+    use optics::iid_masks;
+    use reconstruction::registration::{Correction, Interpolation, Similarity};
+
+    #[test]
+    fn bad_pixels_of_the_sensor_stay_where_they_are() {
+        let (frames, height, width) = (2, 90, 40);
+        let mut masks = iid_masks(frames, height, width, 5).unwrap();
+        masks.slice_mut(s![.., 60..66, 20..26]).fill(f32::NAN);
+        let folder = tempfile::tempdir().unwrap();
+        let (stored, scratch) = (folder.path().join("masks"), folder.path().join("scratch"));
+        let file = std::fs::File::create(&stored).unwrap();
+        let mut writer = planar::writer(file, frames, height, width).unwrap();
+        masks.outer_iter().for_each(|mask| writer.write_frame(mask).unwrap());
+        writer.finish().unwrap();
+        std::fs::File::create(&scratch).unwrap();
+        let reader = Reader::open(&stored, &Limits::default()).unwrap();
+        let correction = Correction {
+            motion: Similarity::shifted([4.0, -3.0]),
+            interpolation: Interpolation::default(),
+        };
+        let mut moved = Array3::zeros(masks.dim());
+        let mut frame = 0;
+        correct(&reader, correction, &scratch, |_, mask| {
+            if let Some(mask) = mask {
+                moved.slice_mut(s![frame, .., ..]).assign(&mask);
+                frame += 1;
+            }
+            Ok(())
+        })
+        .unwrap();
+        for ((k, i, j), value) in moved.indexed_iter() {
+            let is_bad = (60..66).contains(&i) && (20..26).contains(&j);
+            let is_unknown = (64..70).contains(&i) && (17..23).contains(&j);
+            let is_outside = i < 4 || j >= 37;
+            if is_bad || is_unknown {
+                assert!(value.is_nan(), "{k} {i} {j}: {value}");
+            } else if !is_outside {
+                assert!((value - masks[(k, i - 4, j + 3)]).abs() < 1e-5, "{k} {i} {j}: {value}");
+            }
+        }
+    }
 }

@@ -126,19 +126,25 @@ pub fn register<E: From<ReconError>>(
     Ok(search.verdict(best, &fit)?)
 }
 
-/// Chooses the interpolation of masks by a known `motion`, from the first piece as for [`register`].
+/// Chooses the interpolation of masks by a known `motion`, and tests this motion, on the first piece as for [`register`].
+/// Returns `||y - Hv||^2 / ||y||^2` without and with the motion; `None` if the piece has no light or diverges.
 ///
 /// # Errors
 /// Those of [`register`].
-pub fn interpolation<E: From<ReconError>>(
+pub fn known<E: From<ReconError>>(
     plan: &Plan,
     y: ArrayView2<'_, f32>,
     motion: Similarity,
     masks: impl Fn(&Window) -> Result<Array3<f32>, E>,
     proceed: &mut dyn FnMut(f64) -> bool,
-) -> Result<Interpolation, E> {
+) -> Result<(Interpolation, Option<[f64; 2]>), E> {
     let first = Piece::read(plan, &plan.first, y, &masks)?;
-    Ok(Search::new(plan, first, proceed).interpolation(motion)?)
+    let mut search = Search::new(plan, first, proceed);
+    let interpolation = search.interpolation(motion)?;
+    let errors = search.before_and_after(Correction { motion, interpolation })?;
+    let norm = search.norm();
+    let relative = |errors: Vec<f64>| errors.iter().sum::<f64>() / norm;
+    Ok((interpolation, errors.filter(|_| norm > 0.0).map(|errors| errors.map(relative))))
 }
 
 /// Draws two sets of hold-out pixels of a measurement \[1,h,w\]. No pixel is in both.
@@ -295,6 +301,19 @@ impl<'a> Search<'a> {
         Ok(Some(all))
     }
 
+    /// These errors without and with a motion.
+    fn before_and_after(&mut self, best: Correction) -> Result<Option<[Vec<f64>; 2]>> {
+        let unmoved = Correction { motion: Similarity::default(), ..best };
+        let before = self.deciding_errors(unmoved)?;
+        let after = self.deciding_errors(best)?;
+        Ok(before.zip(after).map(|(before, after)| [before, after]))
+    }
+
+    /// The sum of squares of the measurement at these pixels.
+    fn norm(&self) -> f64 {
+        self.pieces.iter().map(|piece| piece.draws[1].norm(piece.y.view())).sum()
+    }
+
     /// The shift by whole pixels with the smallest error of the first piece.
     fn whole_pixels(&mut self) -> Result<Option<Correction>> {
         let reach = self.plan.reach() as i32;
@@ -429,14 +448,9 @@ impl<'a> Search<'a> {
 
     /// Decides on the best motion. The other draw took no part in the search, so its errors are not biased by it.
     fn verdict(&mut self, best: Correction, fit: &Fit) -> Result<Option<Registration>> {
-        let unmoved = Correction { motion: Similarity::default(), ..best };
-        let before = self.deciding_errors(unmoved)?;
-        let after = self.deciding_errors(best)?;
-        let wrong = self.deciding_errors(best.elsewhere())?;
-        let (Some(before), Some(after), Some(wrong)) = (before, after, wrong) else {
-            return Ok(None);
-        };
-        let norm: f64 = self.pieces.iter().map(|piece| piece.draws[1].norm(piece.y.view())).sum();
+        let Some([before, after]) = self.before_and_after(best)? else { return Ok(None) };
+        let Some(wrong) = self.deciding_errors(best.elsewhere())? else { return Ok(None) };
+        let norm = self.norm();
         let is_explained = after.iter().sum::<f64>() < EXPLAINED * wrong.iter().sum::<f64>();
         let converged = fit.has_settled && is_explained && self.plan.includes(&best.motion);
         Ok(Some(Registration {
