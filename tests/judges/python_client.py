@@ -101,6 +101,7 @@ def repeated(client, result, folder):
     [file] = [file for file in other["content"]["snapshots"][1]["files"] if file["name"] == "frames.npy"]
     file["sha256"] = "0" * 64
     assert again.differences(other) == [1]
+    again.delete()
 
 
 def main():
@@ -157,6 +158,8 @@ def main():
         calibration = client.calibration(result.job.record["calibration"])
         found = concurrent(client, calibration, list(measurement))
         assert [len(one.frames) for one in found] == [count] * snapshots
+        for one in found:
+            one.job.delete()
         # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
         assert later.state == "succeeded" and later.id in [job.id for job in client.jobs()]
