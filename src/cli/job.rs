@@ -159,7 +159,8 @@ async fn delete_all(
         }
     }
     let names: Vec<&str> = states.iter().map(|state| state.into_str()).collect();
-    let jobs = format!("{count} jobs of {lab} ({}) and their results", names.join(", "));
+    let plural = if count == 1 { "" } else { "s" };
+    let jobs = format!("{count} job{plural} of {lab} ({}) with all results", names.join(", "));
     if yes || count == 0 {
         return Ok(format!("deleted {jobs}"));
     }

@@ -647,6 +647,9 @@ export async function manage(page, checks, label) {
   await checks.look(page, "delete");
   await page.click("dialog >> text=Keep");
   checks.that((await page.$(row)) !== null, "declining keeps the job");
+  await page.check("[aria-label='Select all jobs']");
+  checks.that(!(await page.textContent("#delete-all")).endsWith(" 1"), "all jobs are selected");
+  await page.uncheck("[aria-label='Select all jobs']");
   await page.check(`${row} input[type=checkbox]`);
   await page.click("#delete-all");
   await page.click("dialog button.danger");
