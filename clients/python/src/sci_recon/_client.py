@@ -412,7 +412,7 @@ class Client:
 
     def _exists(self, path: str) -> bool:
         try:
-            return self._get(path).get("state", "ready") == "ready"
+            return bool(self._get(path).get("state", "ready") == "ready")
         except ApiError as error:
             if error.status == 404:
                 return False
