@@ -130,7 +130,7 @@ function repeat(found) {
     announce("Command copied");
   });
   if (!navigator.clipboard) copy.hidden = true;
-  const anywhere = found.state === "succeeded" && h("p", { class: "muted" }, "On a service without the measurement: download the ",
+  const anywhere = found.state === "succeeded" && h("p", { class: "muted below" }, "On a service without the measurement: download the ",
     h("a", { href: `/v1/jobs/${found.id}/exports/manifest`, download: "manifest.json" }, "manifest of the job"), ", and run ", h("code", null, "sci-recon submit --manifest manifest.json"), " with the files that it asks for.");
   return h("details", null, h("summary", null, "Repeat this job"), h("pre", { tabindex: 0, class: "line" }, text), copy, anywhere);
 }
