@@ -8,7 +8,8 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %   FRAMES = SCI_RECON(ID) returns the frames of an existing job, such as one that was submitted in the dashboard. It
 %   waits for a job that has not ended.
 %
-%   [FRAMES, JOB] = ... also returns the service's description of the job.
+%   [FRAMES, JOB] = ... also returns the service's description of the job. Findings of the checks are warnings with the
+%   identifier sci_recon:CODE and the remedy.
 %
 %   SCI_RECON(..., NAME, VALUE, ...). For an existing job, only 'url', 'token' and 'quiet' matter:
 %     'url'         address of the service   (default: environment SCI_RECON_URL, or http://127.0.0.1:8080)
@@ -17,8 +18,19 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %     'full_scale'  the number in MEASUREMENT that means 1 (default 1; never guessed)
 %     'masks_full_scale'  the number in MASKS that means 1
 %     'mosaic'      'rggb', 'bggr', 'grbg' or 'gbrg' for a colour sensor: FRAMES are [H,W,3,B], or [H,W,3,B,S], then
-%     'camera_fps', 'exposure_s', 'label'   kept with the measurement and the job
+%     'dark'        captures of the dark [H,W] or [H,W,N], whose average is subtracted from the measurement
+%     'saturation'  the smallest number in MEASUREMENT of a saturated pixel
+%     'bad_pixels'  a map [H,W] that is not 0 at bad pixels
+%     'dispersion'  a struct for a spectral camera with one mask: axis, offsets, wavelengths, mask
+%     'camera_fps', 'exposure_s', 'sequence'   times of the camera; 'contiguous' or 'separate'
+%     'masks_name', 'name', 'label'   names of calibration, measurement and job
+%     'snapshots'   'all' (default), an index from 0, or [first last]
 %     'schedule'    a struct that replaces the algorithm's default schedule
+%     'tile'        [size overlap] in pixels
+%     'registration'  'auto' (default), 'off', or the shift [rows columns] of the masks in pixels
+%     'model'       the network of 'learned'
+%     'truth'       true frames [H,W,B] or [H,W,B,S]; the dashboard shows PSNR and SSIM
+%     'priority', 'webhook'   order in the queue, and an address that is notified at the end
 %     'quiet'       true: print no progress
 %
 %   Uploads and downloads resume after a lost connection. Errors have the service's code as identifier, such as
@@ -50,25 +62,49 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 
   calibration = request(o, 'POST', '/v1/calibrations', ...
                         given(struct('masks', upload(o, masks), 'full_scale', o.masks_full_scale, ...
-                                     'mosaic', o.mosaic)));
+                                     'mosaic', o.mosaic, 'dispersion', o.dispersion, 'name', o.masks_name, ...
+                                     'bad_pixels', upload(o, o.bad_pixels))));
   calibration = ready(o, '/v1/calibrations/', calibration);
-  taken = request(o, 'POST', '/v1/measurements', ...
-                  given(struct('calibration', calibration.id, 'data', upload(o, measurement), ...
-                               'full_scale', o.full_scale, 'camera_fps', o.camera_fps, 'exposure_s', o.exposure_s)));
-  taken = ready(o, '/v1/measurements/', taken);
-  for k = 1:numel(taken.warnings)
-    found = element(taken.warnings, k);
-    warning(['sci_recon:' found.code], '%s. What to do: %s.', found.detail, found.remedy);
+  body = given(struct('calibration', calibration.id, 'data', upload(o, measurement), 'full_scale', o.full_scale, ...
+                      'saturation', o.saturation, 'camera_fps', o.camera_fps, 'exposure_s', o.exposure_s, ...
+                      'sequence', o.sequence, 'name', o.name));
+  if ~isempty(o.dark)
+    body.dark = {upload(o, o.dark)};
   end
+  taken = ready(o, '/v1/measurements/', request(o, 'POST', '/v1/measurements', body));
 
+  if isnumeric(o.registration) && ~isempty(o.registration)
+    o.registration = struct('shift', o.registration);
+  end
+  if ~isempty(o.tile)
+    o.tile = struct('size', o.tile(1), 'overlap', o.tile(2));
+  end
+  truth = upload(o, reshape(o.truth, size(o.truth, 1), size(o.truth, 2), []));
   job = request(o, 'POST', '/v1/jobs', ...
                 given(struct('measurement', taken.id, 'algorithm', o.algorithm, 'schedule', o.schedule, ...
-                             'label', o.label)));
+                             'snapshots', o.snapshots, 'tile', o.tile, 'model', o.model, ...
+                             'registration', o.registration, 'sequence', o.sequence, 'truth', truth, ...
+                             'priority', o.priority, 'label', o.label, 'webhook', o.webhook)));
   [frames, job] = collect(o, job);
+end
+
+function codes = warn(findings, codes)
+  % Issues findings as warnings, except those with a code in `codes`; returns all codes.
+  for k = 1:numel(findings)
+    found = element(findings, k);
+    if ~any(strcmp(found.code, codes))
+      warning(['sci_recon:' found.code], '%s. What to do: %s.', found.detail, found.remedy);
+    end
+  end
+  for k = 1:numel(findings)
+    found = element(findings, k);
+    codes{end + 1} = found.code;
+  end
 end
 
 function [frames, job] = collect(o, job)
   % Waits until a job has ended, and downloads its frames.
+  codes = warn(job.warnings, {});
   shown = -1;
   delay = 0.2;
   while any(strcmp(job.state, {'queued', 'running', 'cancelling'}))
@@ -83,6 +119,9 @@ function [frames, job] = collect(o, job)
   if ~strcmp(job.state, 'succeeded')
     error(['sci_recon:' job.state], 'job %s (%s): %s', job.id, job.state, char(job.error));
   end
+  if isstruct(job.assessment)
+    warn(job.assessment.reasons, codes);
+  end
 
   frames = [];
   for s = job.snapshots.first + (0:job.snapshots.count - 1)
@@ -93,8 +132,11 @@ end
 
 function o = options(flags)
   o = struct('url', getenv('SCI_RECON_URL'), 'token', getenv('SCI_RECON_TOKEN'), ...
-             'algorithm', 'pnp-tv-fastdvdnet', 'full_scale', 1, 'masks_full_scale', 1, 'camera_fps', [], ...
-             'exposure_s', [], 'mosaic', [], 'label', [], 'schedule', [], 'quiet', false);
+             'algorithm', 'pnp-tv-fastdvdnet', 'full_scale', 1, 'masks_full_scale', 1, 'dark', [], ...
+             'saturation', [], 'bad_pixels', [], 'mosaic', [], 'dispersion', [], 'camera_fps', [], ...
+             'exposure_s', [], 'sequence', [], 'masks_name', [], 'name', [], 'label', [], 'snapshots', [], ...
+             'schedule', [], 'tile', [], 'registration', [], 'model', [], 'truth', [], 'priority', [], ...
+             'webhook', [], 'quiet', false);
   for k = 1:2:numel(flags)
     if k == numel(flags) || ~ischar(flags{k}) || ~isfield(o, flags{k})
       error('sci_recon:option', 'options are pairs of a name and a value; the names are %s', ...
@@ -182,7 +224,11 @@ function refuse(o, status, file, what)
 end
 
 function hash = upload(o, values)
-  % Uploads an array with tus 1.0 in pieces, and resumes after a lost connection.
+  % Uploads an array with tus 1.0 in pieces, and resumes after a lost connection. An empty array has no hash.
+  hash = '';
+  if isempty(values)
+    return
+  end
   file = tempname();
   answer = tempname();
   clean = onCleanup(@() remove({file, answer, [file '.piece'], [file '.head']}));
@@ -193,7 +239,6 @@ function hash = upload(o, values)
   location = '';
   failures = 0;
   offset = 0;
-  hash = '';
   while isempty(hash)
     if isempty(location)
       status = curl(o, sprintf('-X POST -H "Tus-Resumable: 1.0.0" -H "Upload-Length: %d" -D "%s.head" -o "%s"', ...

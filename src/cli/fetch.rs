@@ -8,6 +8,7 @@ use serde_json::json;
 use super::CliError;
 use super::client::{Client, ServiceArguments, Wanted};
 use super::error::Result;
+use super::manifest::ManifestArguments;
 use super::output::print_line;
 use super::verdict;
 use super::wait::wait;
@@ -31,6 +32,8 @@ pub struct Arguments {
     #[arg(long = "file", value_name = "NAME", value_delimiter = ',', value_enum,
           default_values = ["frames.npy", "stack.exr", "manifest.json"])]
     files: Vec<Wanted>,
+    #[command(flatten)]
+    compared: ManifestArguments,
     /// Print a JSON object with the names of the files.
     #[arg(long)]
     json: bool,
@@ -39,6 +42,7 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
+        let manifest = arguments.compared.read()?;
         let job = client.job(&arguments.job.to_string(), 0).await?;
         if job.state != JobState::Succeeded {
             let text = format!("job {} is {}, and has no results", job.id, job.state);
@@ -50,12 +54,22 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             eprintln!("{}", job.summary());
         }
         let files = client.fetch(&job, &arguments.files, &folder).await?;
+        let comparison = match &manifest {
+            Some(manifest) => Some(manifest.compare(&client, &job.id).await?),
+            None => None,
+        };
         match arguments.json {
             true => print_line(json!({
                 "job": job.id, "files": files,
-                "assessment": job.assessment, "findings": findings,
+                "assessment": job.assessment, "findings": findings, "comparison": comparison,
             }))?,
-            false => files.iter().try_for_each(|file| print_line(file.display()))?,
+            false => {
+                comparison.iter().for_each(|comparison| eprintln!("{}", comparison.indented()));
+                files.iter().try_for_each(|file| print_line(file.display()))?;
+            }
+        }
+        if let Some(difference) = comparison.and_then(|comparison| comparison.failure(&job.id)) {
+            return Err(CliError::Failure(difference));
         }
         verdict::refuse_bad([(&*findings, job.assessment.as_ref())])
     })

@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand};
+use clap::{ArgGroup, Args, Subcommand};
 
+use super::CliError;
 use super::audited::{Change, audit_log, audited};
 use super::wait::print_of_store;
 use crate::audit::AuditLog;
@@ -11,6 +12,9 @@ use crate::cli::error::Result;
 use crate::config::AuditArguments;
 use engine::job::{JobId, JobState, Lab, Label, priority_error};
 use store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
+
+/// Jobs per query.
+const PAGE: u32 = 1000;
 
 /// Manage the jobs of all labs.
 ///
@@ -58,10 +62,25 @@ enum Action {
         #[arg(value_name = "N", allow_negative_numbers = true, value_parser = priority)]
         priority: i32,
     },
-    /// Delete a job that has ended, and its results.
+    /// Delete jobs that have ended, and their results.
+    #[command(group = ArgGroup::new("which").args(["jobs", "all"]).required(true))]
     Delete {
-        /// The job's identifier.
-        job: JobId,
+        /// The jobs' identifiers.
+        #[arg(value_name = "JOB")]
+        jobs: Vec<JobId>,
+        /// Delete all jobs of a lab that have ended.
+        #[arg(long, requires = "lab")]
+        all: bool,
+        /// The lab.
+        #[arg(long, value_name = "NAME", requires = "all")]
+        lab: Option<Lab>,
+        /// Only jobs in these final states, separated by commas.
+        #[arg(long, value_name = "STATE", value_delimiter = ',', requires = "all",
+              default_values = ["succeeded", "failed", "cancelled"])]
+        state: Vec<JobState>,
+        /// Confirm the deletion of all jobs; without it, they are counted.
+        #[arg(long, requires = "all")]
+        yes: bool,
     },
 }
 
@@ -83,7 +102,12 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
             let jobs = store.jobs(lab.as_ref(), &filter, limit).await?.items;
             return Ok(table(&jobs, &store.progress_of(&jobs).await?));
         }
-        Action::Delete { job } => (job, "job delete"),
+        Action::Delete { ref jobs, ref lab, ref state, yes, .. } => {
+            return match lab {
+                Some(lab) => delete_all(store, log, (lab, state), yes).await,
+                None => delete_each(store, log, jobs).await,
+            };
+        }
         Action::Cancel { job } => (job, "job cancel"),
         Action::Retry { job } => (job, "job retry"),
         Action::Priority { job, .. } => (job, "job priority"),
@@ -91,18 +115,67 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
     let lab = store.job_of_any_lab(id).await?.lab;
     let change = Change { action: name, lab: Some(lab.clone()), object: id.to_string() };
     audited(store, log, change, async || alter(store, &lab, action).await).await?;
-    if matches!(action, Action::Delete { .. }) {
-        return Ok(format!("deleted {id} of {lab}"));
-    }
     let jobs = [store.job_of_any_lab(id).await?];
     Ok(table(&jobs, &store.progress_of(&jobs).await?))
+}
+
+/// Deletes jobs of any lab.
+async fn delete_each(store: &Store, log: &AuditLog, jobs: &[JobId]) -> Result<String> {
+    let mut lines = Vec::with_capacity(jobs.len());
+    for &job in jobs {
+        let lab = store.job_of_any_lab(job).await?.lab;
+        delete(store, log, &lab, job).await?;
+        lines.push(format!("deleted {job} of {lab}"));
+    }
+    Ok(lines.join("\n"))
+}
+
+/// Deletes the jobs of a lab in some final states.
+///
+/// Errors: a state that is not final; without `yes`, the number of jobs.
+async fn delete_all(
+    store: &Store,
+    log: &AuditLog,
+    (lab, states): (&Lab, &[JobState]),
+    yes: bool,
+) -> Result<String> {
+    if let Some(state) = states.iter().find(|state| !state.is_final()) {
+        let text = format!("jobs that are {state} can't be deleted: cancel them first");
+        return Err(CliError::Input(text));
+    }
+    let mut filter = JobFilter { states: Some(states.to_vec()), ..JobFilter::default() };
+    let mut count = 0_u64;
+    loop {
+        let page = store.jobs(Some(lab), &filter, PAGE).await?;
+        for job in &page.items {
+            if yes {
+                delete(store, log, lab, job.id).await?;
+            }
+            count += 1;
+        }
+        match page.items.last() {
+            Some(last) if page.more => filter.after = Some(last.id),
+            _ => break,
+        }
+    }
+    let names: Vec<&str> = states.iter().map(|state| state.into_str()).collect();
+    let plural = if count == 1 { "" } else { "s" };
+    let jobs = format!("{count} job{plural} of {lab} ({}) with all results", names.join(", "));
+    if yes || count == 0 {
+        return Ok(format!("deleted {jobs}"));
+    }
+    Err(CliError::Input(format!("this deletes {jobs}: add --yes to confirm")))
+}
+
+async fn delete(store: &Store, log: &AuditLog, lab: &Lab, job: JobId) -> Result<()> {
+    let change = Change { action: "job delete", lab: Some(lab.clone()), object: job.to_string() };
+    audited(store, log, change, async || store.delete_job(lab, job).await).await
 }
 
 /// Changes a job of this lab.
 async fn alter(store: &Store, lab: &Lab, action: &Action) -> Result<(), StoreError> {
     match *action {
-        Action::List { .. } => Ok(()),
-        Action::Delete { job } => store.delete_job(lab, job).await,
+        Action::List { .. } | Action::Delete { .. } => Ok(()),
         Action::Cancel { job } => store.cancel_job(lab, job).await.map(drop),
         Action::Retry { job } => store.retry_job(lab, job).await.map(drop),
         Action::Priority { job, priority } => {

@@ -14,6 +14,7 @@ mod exec;
 mod guard;
 mod logging;
 mod maintenance;
+mod manifest;
 mod masks;
 mod model;
 mod output;

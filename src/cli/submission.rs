@@ -87,19 +87,74 @@ pub(super) struct SubmissionArguments {
     /// ROWS,COLUMNS[,DEGREES[,SCALE]] to state the shift in pixels, a clockwise rotation and a factor [default: auto].
     #[arg(long, value_name = "WHICH", value_parser = registration, allow_hyphen_values = true, help_heading = JOB)]
     registration: Option<RegistrationRequest>,
-    /// From -100 to 100; jobs of higher priority are served first.
-    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, help_heading = JOB)]
-    priority: i32,
     /// True frames [frame, row, column] of this snapshot, or of all. PSNR and SSIM are relative to them.
     #[arg(long, value_name = "FILE", help_heading = JOB)]
     truth: Option<PathBuf>,
+    #[command(flatten, next_help_heading = JOB)]
+    plain: PlainArguments,
+}
+
+/// Options of a job that do not change its frames.
+#[derive(Debug, Args)]
+pub(super) struct PlainArguments {
+    /// From -100 to 100; jobs of higher priority are served first.
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true)]
+    priority: i32,
     /// Label of the job [default: none; of watch-folder: the name of the file].
-    #[arg(long, value_name = "TEXT", help_heading = JOB)]
+    #[arg(long, value_name = "TEXT")]
     label: Option<String>,
     /// Address that is notified when the job ends; the administrator allows its host [default: none].
-    #[arg(long, value_name = "URL", help_heading = JOB)]
+    #[arg(long, value_name = "URL")]
     webhook: Option<String>,
 }
+
+impl PlainArguments {
+    /// Adds the options to a request for a job.
+    pub(super) fn add_to(&self, job: &mut Map<String, Value>) {
+        add(job, "priority", json!(self.priority));
+        add(job, "label", json!(self.label));
+        add(job, "webhook", json!(self.webhook));
+    }
+}
+
+/// Options of [`SubmissionArguments`] that a manifest states. [`PlainArguments`] has the others.
+pub(super) const SETTINGS: [&str; 35] = [
+    "calibration",
+    "masks",
+    "registration_of",
+    "masks_array",
+    "masks_axes",
+    "masks_crop",
+    "masks_frames",
+    "masks_packing",
+    "masks_full_scale",
+    "masks_name",
+    "bad_pixels",
+    "mosaic",
+    "dispersion_offsets",
+    "dispersion_axis",
+    "dispersion_wavelengths",
+    "dispersion_mask",
+    "array",
+    "axes",
+    "crop",
+    "packing",
+    "dark",
+    "saturation",
+    "full_scale",
+    "camera_fps",
+    "exposure_s",
+    "sequence",
+    "name",
+    "algorithm",
+    "model",
+    "schedule",
+    "snapshots",
+    "tile",
+    "overlap",
+    "registration",
+    "truth",
+];
 
 const CALIBRATION: &str = "Calibration";
 const MEASUREMENT: &str = "Measurement";
@@ -122,15 +177,15 @@ impl SubmissionArguments {
             .chain(&self.truth)
     }
 
+    /// Options that do not change the frames.
+    pub(super) fn plain(&self) -> &PlainArguments {
+        &self.plain
+    }
+
     /// Uploads masks, dark captures and true frames, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
         let schedule = self.schedule()?;
         let dispersion = self.dispersion.resolve()?;
-        // One file of masks, or one job, creates one calibration for all clients.
-        let create = async |body: Value| {
-            let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
-            client.create_checked("/v1/calibrations", &body, &key).await
-        };
         let calibration = match (&self.calibration, &self.masks, &self.registration_of) {
             (Some(_), ..) | (_, None, Some(_)) if dispersion.is_some() => {
                 let text =
@@ -145,12 +200,13 @@ impl SubmissionArguments {
                 };
                 let sent = client.upload_with_bar(masks).await?;
                 let body = self.calibration_request(sent, bad_pixels, dispersion);
-                create(body).await.map_err(|error| error.about(Role::Masks, masks))?
+                let created = create_calibration(client, &body).await;
+                created.map_err(|error| error.about(Role::Masks, masks))?
             }
             (None, None, Some(job)) => {
                 let mut body = Map::from_iter([("registration_of".to_owned(), json!(job))]);
                 add(&mut body, "name", json!(self.masks_name));
-                create(Value::Object(body)).await?
+                create_calibration(client, &Value::Object(body)).await?
             }
             (None, None, None) => {
                 let text = "give --masks FILE, --calibration ID or --registration-of JOB";
@@ -223,10 +279,8 @@ impl SubmissionArguments {
         add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
         add(&mut body, "tile", json!(tile));
         add(&mut body, "registration", json!(self.registration));
-        add(&mut body, "priority", json!(self.priority));
         add(&mut body, "truth", json!(truth));
-        add(&mut body, "label", json!(self.label));
-        add(&mut body, "webhook", json!(self.webhook));
+        self.plain.add_to(&mut body);
         body
     }
 
@@ -238,6 +292,12 @@ impl SubmissionArguments {
         let text = std::fs::read_to_string(path).map_err(|error| refused(&error))?;
         serde_json::from_str(&text).map_err(|error| refused(&error))
     }
+}
+
+/// Creates a calibration, once for all clients that send the same request.
+pub(super) async fn create_calibration(client: &Client, body: &Value) -> Result<String> {
+    let key = format!("calibration-{}", Sha256::of(body.to_string().as_bytes()));
+    client.create_checked("/v1/calibrations", body, &key).await
 }
 
 fn add(request: &mut Map<String, Value>, name: &str, value: Value) {
@@ -351,6 +411,10 @@ mod tests {
         let options: BTreeSet<&str> =
             command.get_arguments().filter_map(|arg| arg.get_long()).collect();
         assert_eq!(options, known, "an option is missing in this test");
+        let mut stated: BTreeSet<String> =
+            super::SETTINGS.iter().map(|name| name.replace('_', "-")).collect();
+        stated.extend(["priority", "label", "webhook"].map(str::to_owned));
+        assert!(stated.iter().eq(&known), "a manifest states the settings: {stated:?}");
         let line = values.iter().map(|(name, value)| format!("--{name}={value}"));
         let line = ["test".to_owned()].into_iter().chain(line);
         let matches = command.try_get_matches_from(line).unwrap();

@@ -3,23 +3,33 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use serde_json::Value;
 use uuid::Uuid;
 
+use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
+use super::manifest::Manifest;
 use super::output::print_line;
-use super::submission::SubmissionArguments;
+use super::submission::{SETTINGS, SubmissionArguments};
 use super::verdict;
 use super::wait::wait;
 
 /// Upload masks and snapshots and submit a job.
 ///
+/// With --manifest, repeat the job of a manifest; `watch JOB --manifest FILE` compares the frames.
+///
 /// Prints the identifier of the job. Findings of the checks go to standard error; ends with 3 if there are
 /// errors among them.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Snapshots [row, column] or [snapshot, row, column].
-    measurement: PathBuf,
+    /// Snapshots [row, column] or [snapshot, row, column]; with --manifest, the inputs that the service lacks.
+    #[arg(value_name = "FILE", required_unless_present = "manifest")]
+    files: Vec<PathBuf>,
+    /// The manifest of a job, which is repeated with the same calibration, measurement and settings.
+    #[arg(long, value_name = "FILE", group = "camera",
+          conflicts_with_all = SETTINGS)]
+    manifest: Option<PathBuf>,
     #[command(flatten)]
     service: ServiceArguments,
     #[command(flatten)]
@@ -35,10 +45,8 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
-        let recipe = arguments.submission.recipe(&client).await?;
-        let data = client.upload_with_bar(&arguments.measurement).await?;
         let key = arguments.key.clone().unwrap_or_else(|| Uuid::now_v7().to_string());
-        let job = recipe.submit(&client, (&arguments.measurement, data), None, &key).await?;
+        let job = submit(&client, arguments, &key).await?;
         if arguments.json {
             print_line(&job)?;
         }
@@ -49,4 +57,19 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         }
         verdict::refuse_bad([(&*job.warnings, None)])
     })
+}
+
+async fn submit(client: &Client, arguments: &Arguments, key: &str) -> Result<Value> {
+    let Arguments { files, submission, .. } = arguments;
+    if let Some(manifest) = &arguments.manifest {
+        return Manifest::read(manifest)?.submit(client, files, submission.plain(), key).await;
+    }
+    let [file] = files.as_slice() else {
+        let text =
+            "give one file of snapshots: several snapshots are an array or a TIFF in one file";
+        return Err(CliError::Input(text.into()));
+    };
+    let recipe = submission.recipe(client).await?;
+    let data = client.upload_with_bar(file).await?;
+    Ok(recipe.submit(client, (file, data), None, key).await?)
 }

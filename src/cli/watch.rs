@@ -8,15 +8,16 @@ use super::CliError;
 use super::client::{Client, Job, ServiceArguments};
 use super::error::Result;
 use super::exec::{End, ExecArguments};
+use super::manifest::{Manifest, ManifestArguments};
 use super::output::print_line;
 use super::progress;
 use super::verdict;
 use super::wait::wait;
-use engine::job::JobId;
+use engine::job::{JobId, JobState};
 
 /// Wait for jobs, and print verdicts and findings.
 ///
-/// Ends with 1 unless all have succeeded, else with 3 if the checks found errors.
+/// Ends with 1 unless all have succeeded and equal the manifest, if one is given, else with 3 if the checks found errors.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The jobs.
@@ -24,6 +25,8 @@ pub struct Arguments {
     jobs: Vec<JobId>,
     #[command(flatten)]
     service: ServiceArguments,
+    #[command(flatten)]
+    compared: ManifestArguments,
     #[command(flatten)]
     exec: ExecArguments,
     /// Print a JSON object for each job.
@@ -39,6 +42,7 @@ const WAIT: u32 = 20;
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
+        let manifest = arguments.compared.read()?;
         let screen = MultiProgress::with_draw_target(progress::target());
         let wait = if screen.is_hidden() { WAIT } else { WAIT_WITH_BAR };
         let bars: Vec<_> = arguments
@@ -64,21 +68,34 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let jobs = futures_util::future::try_join_all(ends).await;
         // The result does not depend on the bars. A failure to clear them is ignored.
         let _ = screen.clear();
-        report(&jobs?, arguments.json)
+        report(&client, &jobs?, manifest.as_ref(), arguments.json).await
     })
 }
 
-fn report(jobs: &[Job], as_json: bool) -> Result<()> {
+async fn report(
+    client: &Client,
+    jobs: &[Job],
+    manifest: Option<&Manifest>,
+    as_json: bool,
+) -> Result<()> {
+    let mut failures: Vec<String> = jobs.iter().filter_map(Job::failure).collect();
     for job in jobs {
+        let comparison = match manifest.filter(|_| job.state == JobState::Succeeded) {
+            Some(manifest) => Some(manifest.compare(client, &job.id).await?),
+            None => None,
+        };
         match as_json {
             true => print_line(json!({
                 "id": job.id, "state": job.state, "error": job.error,
-                "assessment": job.assessment, "findings": job.findings(),
+                "assessment": job.assessment, "findings": job.findings(), "comparison": comparison,
             }))?,
-            false => print_line(job.summary())?,
+            false => {
+                print_line(job.summary())?;
+                comparison.iter().try_for_each(|comparison| print_line(comparison.indented()))?;
+            }
         }
+        failures.extend(comparison.and_then(|comparison| comparison.failure(&job.id)));
     }
-    let failures: Vec<String> = jobs.iter().filter_map(Job::failure).collect();
     if !failures.is_empty() {
         return Err(CliError::Failure(failures.join("; ")));
     }

@@ -39,7 +39,7 @@ fn page(code: Code) -> String {
                     h1 { (title) }
                     p { code { (code.into_str()) } ", status " (status.as_u16()) ". " (meaning) }
                     p { "The same request " (outcome) ", unless " code { "retryable" } " of the answer is different." }
-                    p { a href="../docs" { "The API reference" } " lists all codes." }
+                    p { a href="../" { "Dashboard" } " · " a href="../docs" { "API reference, which lists all codes" } }
                 }
             }
         }

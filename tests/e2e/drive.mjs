@@ -40,6 +40,10 @@ export async function submit(page, checks, scene, small) {
   await page.waitForSelector(".step:nth-child(1) .verdict:has-text('40 of 48 × 56')");
   // Arrays of a MATLAB file are picked by their names, without typing.
   await drop(page, masks, "bench.mat", small.matlab());
+  await page.waitForSelector(".arraychoice:has-text('64 × 64 × 4') >> text=patterns");
+  const pictures = () => page.$$eval(".arraychoice img", (images) => images.filter((image) => image.naturalWidth > 0).length);
+  await checks.until(pictures, (count) => count === 2, "each array has a picture");
+  await checks.look(page, "submit-arrays");
   await page.click(".askscale >> text=patterns");
   await page.waitForSelector("text=The calibration is accepted.");
   await drop(page, data, "bench.mat", small.matlab());
@@ -71,6 +75,16 @@ export async function submit(page, checks, scene, small) {
   const estimate = await page.textContent(".estimate");
   checks.that(["Done", "Memory", "Disk"].every((word) => estimate.includes(word)), `time, memory and disk are estimated: ${estimate}`);
   checks.that((await page.$("#sequence option[value=separate]")) !== null, "snapshots can be declared independent");
+  // Settings that most jobs leave out; a text that can't be read is refused at once.
+  await page.click("summary >> text=Snapshots, tiles, schedule");
+  for (const [field, wrong, refusal, right] of [["#snapshots", "first", "names no snapshots", "0"], ["#schedule", "{", "is no JSON", ""]]) {
+    await page.fill(field, wrong);
+    await page.press(field, "Tab");
+    await page.waitForSelector(`.estimate .trouble:has-text('${refusal}')`);
+    await page.fill(field, right);
+    await page.press(field, "Tab");
+    await page.waitForSelector(".estimate dd");
+  }
   await checks.look(page, "submit");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
@@ -257,6 +271,8 @@ export async function bands(page, checks, service, scene, count) {
 export async function moved(page, checks) {
   await page.waitForSelector(".quality:has-text('Expected PSNR: about')");
   await page.waitForSelector("section[aria-label=Registration] .shift path");
+  await page.click("text=Save the moved masks as a calibration");
+  await page.waitForSelector("section[aria-label=Registration] a[href^='#/calibrations/']");
   const text = await page.textContent("section[aria-label=Registration]");
   const [, down, left] = text.match(/by (\S+) ± 0\.\d+ pixels downwards and (\S+) ± 0\.\d+ pixels to the left/) ?? [];
   checks.that(Math.abs(down - 2) < 0.05 && Math.abs(left - 1) < 0.05, `the displacement is in words: ${text}`);
@@ -631,6 +647,9 @@ export async function manage(page, checks, label) {
   await checks.look(page, "delete");
   await page.click("dialog >> text=Keep");
   checks.that((await page.$(row)) !== null, "declining keeps the job");
+  await page.check("[aria-label='Select all jobs']");
+  checks.that(!(await page.textContent("#delete-all")).endsWith(" 1"), "all jobs are selected");
+  await page.uncheck("[aria-label='Select all jobs']");
   await page.check(`${row} input[type=checkbox]`);
   await page.click("#delete-all");
   await page.click("dialog button.danger");

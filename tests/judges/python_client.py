@@ -9,6 +9,7 @@ import os
 import re
 import socket
 import sys
+import uuid
 import warnings
 from base64 import b64decode
 from pathlib import Path
@@ -74,6 +75,35 @@ def unreachable():
     assert len(found) == 1 and "127.0.0.1:9" in found[0], issued
 
 
+def concurrent(client, calibration, shots):
+    """The example of the README for asyncio."""
+    text = Path("clients/python/README.md").read_text()
+    [example] = [block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "asyncio" in block]
+    names = {"client": client, "calibration": calibration, "shots": shots}
+    exec(example, names)
+    return names["results"]
+
+
+def repeated(client, result, folder):
+    """A job that is repeated from its manifest has the same frames; missing inputs are named."""
+    again = client.repeat(result.manifest, label="again").wait()
+    assert again.id != result.job.id and again.record["label"] == "again"
+    assert again.differences(result.manifest) == []
+    unknown = json.loads(json.dumps(result.manifest))
+    unknown["run"]["calibration"] = unknown["run"]["measurement"] = str(uuid.uuid4())
+    unknown["content"]["requests"]["measurement"]["data"] = "0" * 64
+    try:
+        client.repeat(unknown, [folder / "masks.npy"])
+        raise AssertionError("a job without its measurement was submitted")
+    except ValueError as error:
+        assert "measurement with the SHA-256 " + "0" * 64 in str(error) and "masks with" not in str(error), error
+    other = json.loads(json.dumps(result.manifest))
+    [file] = [file for file in other["content"]["snapshots"][1]["files"] if file["name"] == "frames.npy"]
+    file["sha256"] = "0" * 64
+    assert again.differences(other) == [1]
+    again.delete()
+
+
 def main():
     folder = Path(sys.argv[1])
     masks = np.load(folder / "masks.npy")
@@ -124,6 +154,12 @@ def main():
         except ApiError as error:
             assert error.code == "invalid_content" and "full_scale" in str(error), error
             assert str(error).count("above the full scale") == 1, error
+        repeated(client, result, folder)
+        calibration = client.calibration(result.job.record["calibration"])
+        found = concurrent(client, calibration, list(measurement))
+        assert [len(one.frames) for one in found] == [count] * snapshots
+        for one in found:
+            one.job.delete()
         # Another process can continue with the job's identifier.
         later = client.job(result.job.id).wait(timeout=10)
         assert later.state == "succeeded" and later.id in [job.id for job in client.jobs()]

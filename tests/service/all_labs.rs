@@ -116,7 +116,9 @@ async fn the_command_line_sees_and_changes_all_labs() {
     assert_eq!(command(&["job", "priority", &job, "500"]).0, 2);
     app.sign_in(&a);
     let path = format!("/v1/jobs/{job}");
-    assert_eq!(app.get(&path).await.json()["priority"], -5);
+    let found = app.get(&path).await.json();
+    assert_eq!(found["priority"], -5);
+    let body = json!({"measurement": found["measurement"], "algorithm": "gap-tv"});
     assert_eq!(command(&["job", "delete", &job]).0, 2, "it has not ended");
     assert!(command(&["job", "cancel", &job]).1.contains("cancelled"));
     assert_eq!(app.get(&path).await.json()["state"], "cancelled");
@@ -125,6 +127,27 @@ async fn the_command_line_sees_and_changes_all_labs() {
     assert_eq!(command(&["job", "delete", &job]).0, 0);
     app.get(&path).await.problem(404, "not_found");
     assert_eq!(command(&["job", "cancel", &job]).0, 2);
+
+    let all = ["job", "delete", "--all", "--lab", "a"];
+    let submit = async || id(&app.post("/v1/jobs", &body).await.expect(201));
+    let jobs = [submit().await, submit().await, submit().await];
+    jobs[..2].iter().for_each(|job| drop(command(&["job", "cancel", job])));
+    for wrong in
+        [&["job", "delete"][..], &["job", "delete", "--all"], &["job", "delete", &jobs[0], "--all"]]
+    {
+        assert_eq!(command(wrong).0, 2, "{wrong:?}");
+    }
+    let (code, text) = command(&[&all[..], &["--state", "queued", "--yes"]].concat());
+    assert!(code == 2 && text.contains("cancel them first"), "{text}");
+    let (code, text) = command(&all);
+    assert!(code == 2 && text.contains("2 jobs of a") && text.contains("--yes"), "{text}");
+    let (_, text) = command(&[&all[..], &["--state", "failed", "--yes"]].concat());
+    assert!(text.contains("deleted 0 jobs of a (failed)"), "{text}");
+    assert!(command(&[&all[..], &["--yes"]].concat()).1.contains("deleted 2 jobs of a"));
+    app.get(&format!("/v1/jobs/{}", jobs[0])).await.problem(404, "not_found");
+    app.get(&format!("/v1/jobs/{}", jobs[2])).await.expect(200);
+    command(&["job", "cancel", &jobs[2]]);
+    assert_eq!(command(&["job", "delete", &jobs[2]]).0, 0);
     let unused = app.upload(vec![7; 5000]).await;
     let (_, uploads) = command(&["lab", "uploads", "a"]);
     let line_of = |sha256: &str| uploads.lines().find(|line| line.starts_with(sha256)).unwrap();

@@ -1,5 +1,6 @@
 //! The client libraries against the real service.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -61,6 +62,50 @@ fn keywords_of_python_are_the_properties_of_the_contract() {
     judge.env("PYTHONPATH", "clients/python/src").arg("tests/judges/python_options.py");
     let output = judge.arg(properties.to_string()).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn options_of_matlab_are_the_properties_of_the_contract() {
+    let contract = std::fs::read_to_string("openapi.yaml").unwrap();
+    let contract: Value = serde_yaml_ng::from_str(&contract).unwrap();
+    // Arrays of MATLAB are in memory: they are selected, ordered and cut there. Files and jobs that make masks, and the identifiers
+    // that link the requests, are no options.
+    let others = [
+        "array",
+        "axes",
+        "crop",
+        "frames",
+        "packing",
+        "captures",
+        "registration_of",
+        "masks",
+        "data",
+        "calibration",
+        "measurement",
+    ];
+    let mut expected = BTreeSet::from(["url", "token", "quiet"].map(str::to_owned));
+    for schema in ["CalibrationRequest", "MeasurementRequest", "JobRequest"] {
+        let properties = &contract["components"]["schemas"][schema]["properties"];
+        for name in properties.as_object().unwrap().keys() {
+            let is_mask_option =
+                schema == "CalibrationRequest" && ["name", "full_scale"].contains(&name.as_str());
+            let prefix = if is_mask_option { "masks_" } else { "" };
+            if !others.contains(&name.as_str()) {
+                expected.insert(format!("{prefix}{name}"));
+            }
+        }
+    }
+    let source = std::fs::read_to_string("clients/matlab/sci_recon.m").unwrap();
+    let (_, options) = source.split_once("function o = options").unwrap();
+    let (options, _) = options.split_once("for k =").unwrap();
+    let quoted = options.split('\'').skip(1).step_by(2);
+    let is_name = |text: &&str| text.chars().all(|c| c.is_ascii_lowercase() || c == '_');
+    let names: BTreeSet<String> = quoted.filter(is_name).map(str::to_owned).collect();
+    assert_eq!(names, expected);
+    let (help, _) = source.split_once("if ischar(masks)").unwrap();
+    for name in names {
+        assert!(help.contains(&format!("'{name}'")), "the help does not explain {name}");
+    }
 }
 
 /// The hot folder in Python, started twice: a job for each file, a report with its results.

@@ -395,6 +395,75 @@ async fn a_dark_is_subtracted_by_submit_and_without_a_server() {
     }
 }
 
+/// Repeats a job from its manifest, where its inputs are, and on another service from the files.
+#[tokio::test]
+async fn a_manifest_repeats_a_job_and_names_what_is_missing() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new(format!("http://{}", app.address()), "");
+    let scene = Scene::SMALL;
+    lab.write("masks.npy", &scene.masks());
+    lab.write("shots.npy", &scene.snapshots());
+    lab.write("dark.npy", &constant(&[scene.height, scene.width], 0.01));
+    // The checks may find errors in the small scene, which gives status 3.
+    let done = async |lab: &Lab, line: &[&str]| {
+        let output = lab.run(line).await;
+        let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!([Some(0), Some(3)].contains(&output.status.code()), "{line:?}: {errors}");
+        (String::from_utf8(output.stdout).unwrap().trim().to_owned(), errors)
+    };
+    let inputs = ["shots.npy", "--masks", "masks.npy", "--dark", "dark.npy"];
+    let settings = ["--algorithm", "gap-tv", "--snapshots", "1", "--label", "first"];
+    let submit = [&["submit"], &inputs[..], &settings].concat();
+    let (first, _) = done(&lab, &submit).await;
+    done(&lab, &["watch", &first]).await;
+    done(&lab, &["fetch", &first, "--out", "out"]).await;
+
+    let manifest = lab.path("out/manifest.json");
+    let manifest = manifest.to_str().unwrap();
+    let (again, _) = done(&lab, &["submit", "--manifest", manifest]).await;
+    assert_ne!(again, first);
+    let (watched, _) = done(&lab, &["watch", &again, "--manifest", manifest]).await;
+    assert!(watched.contains("equal to the manifest"), "{watched}");
+    let fetch = ["fetch", &again, "--out", "again", "--manifest", manifest];
+    let (_, fetched) = done(&lab, &fetch).await;
+    assert!(fetched.contains("equal to the manifest"), "{fetched}");
+    let content = |folder: &str| {
+        let text = std::fs::read(lab.path(folder).join("manifest.json")).unwrap();
+        serde_json::from_slice::<Value>(&text).unwrap()["content"].take()
+    };
+    assert_eq!(content("out"), content("again"));
+
+    let other =
+        [&submit[..], &["--registration", "off", "--tile", "32", "--overlap", "8"]].concat();
+    let (other, _) = done(&lab, &other).await;
+    let different = lab.refused(1, &["watch", &other, "--manifest", manifest]).await;
+    assert!(different.contains("different from the manifest"), "{different}");
+    assert!(different.contains("requests.job.tile.size is 32"), "{different}");
+
+    // Another service has none of the inputs.
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let far = Lab::new(format!("http://{}", app.address()), "");
+    let repeat = ["submit", "--manifest", manifest];
+    let missing = far.refused(2, &repeat).await;
+    for role in ["masks with", "measurement with", "dark of the measurement with"] {
+        assert!(missing.contains(role), "{role}: {missing}");
+    }
+    let [masks, shots, dark] =
+        ["masks.npy", "shots.npy", "dark.npy"].map(|name| lab.path(name).display().to_string());
+    let missing = far.refused(2, &[&repeat[..], &[&shots, &masks]].concat()).await;
+    assert!(missing.contains("dark of") && !missing.contains("masks with"), "{missing}");
+    let foreign = far.refused(2, &[&repeat[..], &[manifest]].concat()).await;
+    assert!(foreign.contains("is no input of the manifest"), "{foreign}");
+    far.refused(2, &[&repeat[..], &["--masks", &masks]].concat()).await;
+    let line = [&repeat[..], &[&dark, &shots, &masks, "--priority", "-3", "--json"]].concat();
+    let (repeated, _) = done(&far, &line).await;
+    let repeated: Value = serde_json::from_str(&repeated).unwrap();
+    assert_eq!((&repeated["label"], &repeated["priority"]), (&json!("first"), &json!(-3)));
+    let watch = ["watch", repeated["id"].as_str().unwrap(), "--manifest", manifest];
+    let (watched, _) = done(&far, &watch).await;
+    assert!(watched.contains("equal to the manifest"), "{watched}");
+}
+
 /// Reads arrays with unusual names from files of other programs.
 #[tokio::test]
 async fn arrays_can_have_any_name() {
@@ -412,7 +481,7 @@ async fn arrays_can_have_any_name() {
         lab.text(&line).await;
         let line = [&["submit", file, "--array", "nothing"][..], &masks, &scale].concat();
         let refused = lab.refused(2, &line).await;
-        assert!(refused.contains("/array") && refused.contains("'shots'"), "{refused}");
+        assert!(refused.contains("/array") && refused.contains("'shots' ("), "{refused}");
     }
     lab.write("plain.npy", &Scene::SMALL.snapshots());
     let line = [&["submit", "plain.npy", "--array", "shots"][..], &masks, &scale].concat();

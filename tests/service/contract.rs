@@ -142,8 +142,63 @@ async fn every_error_type_has_a_page() {
     let page = app.get("/problems/invalid_request").await.expect(200);
     assert!(page.header("content-type").starts_with("text/html"));
     assert!(page.header("content-security-policy").contains("default-src 'none'"));
-    assert!(String::from_utf8_lossy(&page.bytes).contains("invalid_request"));
+    let text = String::from_utf8_lossy(&page.bytes);
+    assert!(text.contains("invalid_request"));
+    for place in ["../", "../docs"] {
+        assert!(text.contains(&format!("href=\"{place}\"")), "a link to {place}");
+    }
     app.get("/problems/nothing").await.problem(404, "not_found");
+}
+
+/// The text of all files below a folder with one of these endings.
+fn sources(folder: &str, endings: &[&str]) -> String {
+    let mut text = String::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+        if path.is_dir() && !path.ends_with("node_modules") {
+            text += &sources(path.to_str().unwrap(), endings);
+        } else if endings.contains(&ending) {
+            text += &std::fs::read_to_string(path).unwrap();
+        }
+    }
+    text
+}
+
+/// Each way in takes all inputs and reports all findings: every cell of the table names a test that exists.
+#[test]
+fn every_way_in_has_its_tests() {
+    let rust = ["tests/service", "src", "crates"].map(|folder| sources(folder, &["rs"])).concat();
+    let walks = sources("tests/e2e", &["mjs"]);
+    let table = std::fs::read_to_string("tests/WAYS.md").unwrap();
+    let rows: Vec<&str> = table.lines().filter(|line| line.starts_with("| ")).skip(2).collect();
+    assert_eq!(rows.len(), 5);
+    for row in rows {
+        let cells: Vec<&str> = row.trim_matches('|').split('|').map(str::trim).collect();
+        assert_eq!(cells.len(), 8, "{row}");
+        for (way, cell) in cells[1..].iter().enumerate() {
+            let name = cell.trim_matches('`');
+            let is_test = rust.contains(&format!("fn {name}("));
+            let is_walk = way == 6 && walks.contains(&format!("export async function {name}("));
+            assert!(!name.is_empty() && (is_test || is_walk), "no test {name}: {row}");
+        }
+    }
+}
+
+#[test]
+fn the_dashboard_states_every_property_of_the_requests() {
+    let forms = ["submit", "fields", "captures", "questions", "actions"];
+    let forms =
+        forms.map(|name| std::fs::read_to_string(format!("src/http/dashboard/{name}.js")).unwrap());
+    let forms = forms.concat();
+    let words: std::collections::BTreeSet<&str> =
+        forms.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').collect();
+    for schema in ["CalibrationRequest", "MeasurementRequest", "JobRequest"] {
+        let properties = &CONTRACT["components"]["schemas"][schema]["properties"];
+        for name in properties.as_object().unwrap().keys() {
+            assert!(words.contains(name.as_str()), "{schema} has {name}, the form has not");
+        }
+    }
 }
 
 #[test]

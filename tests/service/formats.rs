@@ -369,7 +369,10 @@ scipy.io.savemat('masks.mat', {'codes': masks.transpose(1, 2, 0), 'other': masks
     std::fs::write(folder.path().join("y.npy"), Scene::SMALL.snapshots()).unwrap();
     let output = run("masks.mat", &[]);
     let text = String::from_utf8_lossy(&output.stderr);
-    assert!(text.contains("'codes', 'other'") && text.contains("--masks-array"), "{text}");
+    assert!(
+        text.contains("'codes' (48x64x4), 'other' (48x64)") && text.contains("--masks-array"),
+        "{text}"
+    );
     let output = run("masks.mat", &["--masks-array", "codes", "--dark", "dark.mat"]);
     assert!([Some(0), Some(3)].contains(&output.status.code()), "{output:?}");
 }

@@ -20,6 +20,8 @@ fn recipes(document: &str, port: u16, folder: &Path) -> Vec<String> {
         block
             .replace("pnp-tv-fastdvdnet", "gap-tv")
             .replace("sci-recon submit ", "sci-recon submit --algorithm gap-tv ")
+            // A manifest states its algorithm.
+            .replace("--algorithm gap-tv --manifest", "--manifest")
     });
     ours.collect()
 }

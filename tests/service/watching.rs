@@ -149,6 +149,18 @@ async fn an_upload_has_a_preview_before_it_is_used() {
     let outside = app.get(&format!("{path}/frame-4")).await.problem(404, "not_found");
     assert!(outside.contains("1 to 3"), "{outside}");
     app.get(&format!("{path}/frame-0")).await.problem(404, "not_found");
+    for (file, array, size) in [
+        ("names.h5", "calibrated%2Fmasks", (5, 4)),
+        ("names.mat", "shots", (5, 4)),
+        ("matlab73.mat", "meas", (5, 4)),
+    ] {
+        let several = std::fs::read(format!("tests/data/formats/{file}")).unwrap();
+        let several = format!("/view/blobs/{}/pictures", app.upload(several).await);
+        let picture = app.get(&format!("{several}/array-{array}")).await.expect(200);
+        let shown = image::load_from_memory(&picture.bytes).unwrap().to_luma8();
+        assert_eq!(shown.dimensions(), size, "{file}");
+        app.get(&format!("{several}/array-nothing")).await.problem(422, "invalid_content");
+    }
     let text = app.upload(b"no picture at all".to_vec()).await;
     let refused = app.get(&format!("/view/blobs/{text}/pictures/frame-1")).await;
     refused.problem(422, "invalid_content");

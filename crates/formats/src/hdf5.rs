@@ -25,7 +25,7 @@ use hdf5_reader::{
 use super::array::{self, ArrayReader, Samples};
 use super::axes::{Expected, Writer};
 use super::samples::{self, ByteOrder};
-use super::scene::{SceneArray, list};
+use super::scene::{MAX_NAMES, SceneArray, list};
 use super::{Format, FormatError, FrameReader, Limits, SampleType, limits};
 use crate::error::Result;
 
@@ -107,7 +107,7 @@ pub(super) fn open(
     let root = file.root_group().map_err(error)?;
     let Found { dataset, octave } = find(&root, name).map_err(error)?.ok_or_else(|| {
         let (format, name) = (Format::Hdf5, name.to_owned());
-        FormatError::MissingArray { format, name, present: list(&array_paths(&root)) }
+        FormatError::MissingArray { format, name, present: list(&shapes(&root)) }
     })?;
     if octave.is_some() && !name.ends_with("/value") {
         advice.name = python_name(&format!("{name}/value"));
@@ -205,6 +205,25 @@ fn array_paths(root: &Group) -> Vec<String> {
         }
     }
     paths
+}
+
+/// The arrays of a file with their sizes, as the program that wrote the file shows them. The size is empty if it can't be
+/// read, and after the arrays that a message lists.
+fn shapes(root: &Group) -> Vec<(String, Vec<u64>)> {
+    let shape = |path: &str| -> Option<Vec<u64>> {
+        let Found { dataset, octave } = find(root, path).ok()??;
+        let mut shape = dataset.shape().to_vec();
+        if octave.is_some() || dataset.attribute("MATLAB_class").is_ok() {
+            shape.reverse();
+        }
+        Some(shape)
+    };
+    let paths = array_paths(root).into_iter().enumerate();
+    let listed = paths.map(|(index, path)| {
+        let shape = if index < MAX_NAMES { shape(&path) } else { None };
+        (path, shape.unwrap_or_default())
+    });
+    listed.collect()
 }
 
 /// A name as it may stand in a line of Python that a user copies into a shell.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::axes::Expected;
 use super::member::{Member, MemberReader};
 use super::npy;
-use super::scene::{SceneArray, list};
+use super::scene::{MAX_NAMES, SceneArray, list};
 use super::{Format, FormatError, FrameReader, Limits};
 use crate::error::Result;
 
@@ -33,9 +33,14 @@ pub(super) fn open(
         None => array.names().iter().find_map(|name| position(name)),
     };
     let Some(index) = index else {
-        let names: Vec<String> = arrays.into_iter().map(|(name, _)| name).collect();
         let (format, name) = (Format::Npz, name.unwrap_or(array.name()).to_owned());
-        return Err(FormatError::MissingArray { format, name, present: list(&names) });
+        let listed = arrays.into_iter().enumerate().map(|(index, (name, member))| {
+            let length = member.size;
+            let shape = || npy::shape(MemberReader::new(archive.clone(), member), length);
+            (name, if index < MAX_NAMES { shape().unwrap_or_default() } else { Vec::new() })
+        });
+        let present = list(&listed.collect::<Vec<_>>());
+        return Err(FormatError::MissingArray { format, name, present });
     };
     let (_, member) = arrays.swap_remove(index);
     let length = member.size;

@@ -236,7 +236,7 @@ fn check_picture_axes(
 fn several_arrays(format: Format, names: &[String]) -> FormatError {
     FormatError::Unsupported {
         format,
-        found: list(names),
+        found: list(&names.iter().map(|name| (name.clone(), Vec::new())).collect::<Vec<_>>()),
         accepted: "a single array, since this role has no `array`: save the array alone",
     }
 }

@@ -41,12 +41,18 @@ impl SceneArray {
     }
 }
 
-/// Lists names for a message, up to a limit.
-pub(super) fn list(names: &[String]) -> String {
-    const MAX_NAMES: usize = 20;
-    let quoted: Vec<String> =
-        names.iter().take(MAX_NAMES).map(|name| format!("'{name}'")).collect();
-    match (quoted.is_empty(), names.len().saturating_sub(MAX_NAMES)) {
+/// Largest number of arrays in a message.
+pub(super) const MAX_NAMES: usize = 20;
+
+/// Lists arrays for a message, up to a limit: the name, and the size unless it is empty.
+pub(super) fn list(arrays: &[(String, Vec<u64>)]) -> String {
+    let size = |shape: &[u64]| shape.iter().map(u64::to_string).collect::<Vec<_>>().join("x");
+    let quoted = arrays.iter().take(MAX_NAMES).map(|(name, shape)| match shape.is_empty() {
+        true => format!("'{name}'"),
+        false => format!("'{name}' ({})", size(shape)),
+    });
+    let quoted: Vec<String> = quoted.collect();
+    match (quoted.is_empty(), arrays.len().saturating_sub(MAX_NAMES)) {
         (true, _) => "no arrays".to_owned(),
         (false, 0) => quoted.join(", "),
         (false, more) => format!("{} and {more} more", quoted.join(", ")),

@@ -27,7 +27,7 @@ use formats::planar;
 use reconstruction::registration::Correction;
 use store::{
     Claimant, ClaimedTask, Completion, Heartbeat, JobTask, Lease, MovieWork, Product, StagedBlob,
-    Store, StoreError, TaskRecord, TileResult, Watcher, Work, WorkerPlace,
+    Store, StoreError, TileResult, Watcher, Work, WorkerPlace,
 };
 
 /// The store, and the worker that claims from it.
@@ -133,7 +133,7 @@ impl Local {
                 job: *job,
                 spec: Box::new(spec.clone()),
                 recipe: Box::new(recipe(task)?),
-                tasks: tasks(&task.records, attempt)?,
+                tasks: tasks(task, attempt)?,
                 folder: folder()?,
             },
             TaskKind::Check
@@ -415,10 +415,14 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
 
 /// Collects the records of a job's other tasks for its manifest. `attempt` is the number of the manifest task's
 /// attempt.
-fn tasks(records: &[TaskRecord], attempt: u32) -> Result<JobTasks, PipelineError> {
-    let mut tasks =
-        JobTasks { snapshots: Vec::new(), seconds: Vec::new(), attempts: u64::from(attempt) };
-    for task in records {
+fn tasks(task: &JobTask, attempt: u32) -> Result<JobTasks, PipelineError> {
+    let mut tasks = JobTasks {
+        requests: task.repetition.clone().ok_or_else(|| missing_input(TaskKind::Manifest))?,
+        snapshots: Vec::new(),
+        seconds: Vec::new(),
+        attempts: u64::from(attempt),
+    };
+    for task in &task.records {
         tasks.seconds.push((task.kind, task.seconds));
         tasks.attempts += u64::from(task.attempt);
         if let TaskKind::Assemble { snapshot } = task.kind {

@@ -192,6 +192,15 @@ impl Client {
         self.json(|| self.request(reqwest::Method::GET, path)).await
     }
 
+    /// Gets a resource that may not exist.
+    pub(super) async fn find(&self, path: &str) -> Result<Option<Value>> {
+        match self.get(path).await {
+            Ok(value) => Ok(Some(value)),
+            Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
     /// Gets a resource whose work may still run; the service answers at the end of the work, or after `wait` seconds.
     async fn get_ended(&self, path: &str, wait: u32) -> Result<Value> {
         let prefer = format!("wait={wait}");

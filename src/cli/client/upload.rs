@@ -54,12 +54,9 @@ impl Client {
         Err(CliError::Failure(text).into())
     }
 
-    async fn has(&self, sha256: Sha256) -> Result<bool> {
-        match self.get(&format!("/v1/blobs/{sha256}")).await {
-            Ok(_) => Ok(true),
-            Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) => Ok(false),
-            Err(error) => Err(error),
-        }
+    /// True if the lab has uploaded a file with this hash.
+    pub(in crate::cli) async fn has(&self, sha256: Sha256) -> Result<bool> {
+        Ok(self.find(&format!("/v1/blobs/{sha256}")).await?.is_some())
     }
 
     fn tus(&self, method: Method, path: &str) -> RequestBuilder {

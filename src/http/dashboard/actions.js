@@ -3,7 +3,7 @@
 import { announce, explained, h, put, trouble } from "./dom.js";
 import { menu } from "./menu.js";
 import { nameOf } from "./format.js";
-import { send } from "./api.js";
+import { create, send } from "./api.js";
 
 const ACTIONS = {
   cancel: { word: "Cancel", states: ["queued", "running"], run: (job) => send("POST", `/v1/jobs/${job.id}/cancel`) },
@@ -45,6 +45,23 @@ async function remove(job) {
   const text = ["The job ", h("b", null, nameOf(job)), " and its frames will be deleted. The measurement and the calibration are kept."];
   if (!(await ask("Delete this job?", text, "Delete"))) return false;
   return send("DELETE", `/v1/jobs/${job.id}`);
+}
+
+/** A button that makes a calibration of the masks as the job has moved them. */
+export function saveMasks(job) {
+  const result = h("p", { "aria-live": "polite" });
+  const button = h("button", { type: "button", class: "small writes" }, "Save the moved masks as a calibration");
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    try {
+      const made = await create("/v1/calibrations", { registration_of: job.id, name: `moved masks of ${nameOf(job)}`.slice(0, 200) });
+      put(result, "Saved as ", h("a", { href: `#/calibrations/${made.id}` }, "a calibration"), " for further measurements.");
+    } catch (error) {
+      button.disabled = false;
+      put(result, trouble(error));
+    }
+  });
+  return [h("div", { class: "row below" }, button), result];
 }
 
 /** Cancels jobs. A job that has already ended is not changed. */

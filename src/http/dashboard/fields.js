@@ -59,6 +59,48 @@ export function partFields(id, frames, changed, more = []) {
   return { element, value, set, setPacking };
 }
 
+/** The snapshots that a text names, as in a request; null for all. Throws for other texts. */
+function snapshotsOf(text) {
+  if (!text || text === "all") return null;
+  const [, first, last] = /^(\d+)(?:\s*[-–]\s*(\d+))?$/.exec(text) ?? [];
+  if (first === undefined) throw new Error(`“${text}” names no snapshots. State all, an index from 0 such as 3, or a range such as 0-5.`);
+  return last === undefined ? Number(first) : [Number(first), Number(last)];
+}
+
+/**
+ * Fields of a job that most jobs leave at their defaults. `value()` has the stated ones as in a request, and throws for texts
+ * that can't be read; `changed()` is called after each edit.
+ */
+export function furtherFields(changed) {
+  const snapshots = textField("snapshots", "Snapshots, counted from 0", "all, 3 or 0-5");
+  const [size, overlap] = [numberField("tile-size", "Largest side of a tile in pixels", 1), numberField("tile-overlap", "Overlap of tiles in pixels", 1)];
+  const webhook = textField("webhook", "Address to notify at the end", "https://lab.example/hook");
+  const model = h("select", { id: "model" }, h("option", { value: "" }, "none"));
+  const modelLabel = h("label", { for: "model", hidden: true }, "Network of your own, instead of the algorithm", model);
+  const schedule = h("textarea", { id: "schedule", rows: 3, spellcheck: "false", placeholder: '{"stages": [{"prior": "tv", "iterations": 60, "tv_weight": 0.1}]}' });
+  for (const input of [snapshots.input, size.input, overlap.input, webhook.input, model, schedule]) input.addEventListener("change", changed);
+  const scheduleOf = (text) => {
+    try {
+      return text === "" ? null : JSON.parse(text);
+    } catch (error) {
+      throw new Error(`The schedule is no JSON: ${error.message}. “sci-recon schedule” prints one.`);
+    }
+  };
+  const value = () => {
+    const tile = { size: size.value(), overlap: overlap.value() };
+    const network = model.value ? { algorithm: "learned", model: model.value } : {};
+    return { ...given({ snapshots: snapshotsOf(snapshots.value()), tile: tile.size === null && tile.overlap === null ? null : given(tile), schedule: scheduleOf(schedule.value.trim()), webhook: webhook.value() }), ...network };
+  };
+  /** Offers the networks of a calibration. */
+  const offer = (models) => {
+    model.replaceChildren(h("option", { value: "" }, "none"), ...models.map((item) => h("option", { value: item.id }, item.name ?? item.id)));
+    modelLabel.hidden = models.length === 0;
+  };
+  const element = h("details", null, h("summary", null, "Snapshots, tiles, schedule and notification"),
+    h("div", { class: "fields" }, [snapshots, size, overlap, webhook].map((one) => one.element), modelLabel), h("label", { for: "schedule", class: "below" }, "Schedule as JSON, instead of the algorithm’s", schedule));
+  return { element, value, offer };
+}
+
 const CORRECTIONS = [["", "corrected if it helps"], ["stated", "moved by a known motion"], ["off", "used as calibrated"]];
 
 /** Fields for masks that have moved since the calibration. `value()` has the setting as in a request; `changed()` is called after each edit. */

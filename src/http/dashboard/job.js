@@ -1,6 +1,6 @@
 // One job: its quality, frames, files and method.
 
-import { actions, rename } from "./actions.js";
+import { actions, rename, saveMasks } from "./actions.js";
 import { announce, h, marked, put, trouble } from "./dom.js";
 import { bytes, nameOf, stageOf, timeOf } from "./format.js";
 import { isAborted, get, send } from "./api.js";
@@ -61,7 +61,11 @@ export async function job(root, [id], signal) {
     put(progress, line(now));
     viewer.state = now.state;
     viewer.setTruth(now.truth);
-    if (now.registered !== shown?.registered) put(moved, registration(now));
+    if (now.registered !== shown?.registered || now.state !== shown?.state) {
+      const card = registration(now);
+      if (now.state === "succeeded" && now.registered?.applied) card.append(...saveMasks(now));
+      put(moved, card);
+    }
     await tiles.renew(snapshot.value());
     const done = `${now.progress.previews_done} ${now.progress.tiles_done} ${now.progress.snapshots_done} ${now.state}`;
     if (shown && done !== ready) await viewer.renew();

@@ -27,7 +27,8 @@ export async function jobs(root, [query], signal) {
   const picked = h("div", { class: "bar picked", role: "region", "aria-label": "Selected jobs", hidden: true });
   root.className = "fill";
   const scroller = h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Jobs, newest first" });
-  const rows = table("Jobs", columns(chosen, () => choose(), () => look(null)), scroller, rowHeight);
+  const whole = h("input", { type: "checkbox", "aria-label": "Select all jobs", title: "Select all jobs", onchange: (event) => (event.target.checked ? all() : none()) });
+  const rows = table("Jobs", columns(whole, chosen, () => choose(), () => look(null)), scroller, rowHeight);
   const bar = h("div", { class: "bar" }, h("h1", null, "Jobs"), filter.element, count, h("span", { class: "grow" }), h("a", { class: "button primary writes", href: "#/new" }, "New job"));
   root.append(bar, picked, scroller);
   scroller.append(rows.element, empty);
@@ -38,6 +39,7 @@ export async function jobs(root, [query], signal) {
     const ended = found.filter((job) => ["succeeded", "failed", "cancelled"].includes(job.state));
     const live = found.filter((job) => ["queued", "running"].includes(job.state));
     picked.hidden = found.length === 0;
+    whole.checked = found.length > 0 && found.length === list.items.length;
     const after = () => {
       none();
       look(null);
@@ -48,11 +50,14 @@ export async function jobs(root, [query], signal) {
       found.length > MAX_COMPARED && h("span", { class: "muted" }, `(up to ${MAX_COMPARED} can be compared)`),
       live.length > 0 && h("button", { type: "button", class: "small writes", id: "cancel-all", onclick: () => cancelAll(live).then(after) }, `Cancel ${live.length}`),
       ended.length > 0 && h("button", { type: "button", class: "small delete writes", id: "delete-all", onclick: () => removeAll(ended).then((deleted) => deleted && after()) }, `Delete ${ended.length}`),
-      h("button", { type: "button", class: "small", onclick: () => all() }, "Select all loaded"),
+      h("button", { type: "button", class: "small", onclick: () => all() }, "Select all"),
       h("button", { type: "button", class: "small", onclick: () => none() }, "Clear the selection"));
   }
 
-  function all() {
+  /** Selects all jobs of the filter, also those that are not loaded yet. */
+  async function all() {
+    await list.loading;
+    while (!list.complete && (await list.more()));
     list.items.forEach((job) => chosen.add(job.id));
     mark();
   }
@@ -63,7 +68,7 @@ export async function jobs(root, [query], signal) {
   }
 
   function mark() {
-    for (const box of scroller.querySelectorAll(".pick input")) box.checked = chosen.has(box.value);
+    for (const box of scroller.querySelectorAll("td.pick input")) box.checked = chosen.has(box.value);
     choose();
   }
 
@@ -193,9 +198,9 @@ class JobList {
   }
 }
 
-function columns(chosen, choose, done) {
+function columns(whole, chosen, choose, done) {
   return [
-    { title: h("span", { class: "unseen" }, "Select"), class: "pick", fill: (cell, job) => pick(cell, job, chosen, choose) },
+    { title: whole, class: "pick", fill: (cell, job) => pick(cell, job, chosen, choose) },
     { title: h("span", { class: "unseen" }, "Picture"), class: "thumb", fill: thumb },
     { title: "Job", class: "name", fill: name },
     { title: "Verdict", class: "checks", fill: verdict },

@@ -8,7 +8,7 @@ import { steer } from "./view.js";
 
 /** Largest number of tiles in the cache, which drops the least recently used. */
 const MAX_TILES = 500;
-const HINT = "Point at a pixel to read its value.";
+const HINT = `${matchMedia("(pointer: coarse)").matches ? "Touch" : "Point at"} a pixel to read its value.`;
 const tiles = new Map();
 let waiting = [];
 let busy = 0;

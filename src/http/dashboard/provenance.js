@@ -106,7 +106,7 @@ function joints(content) {
   return [...(containing.length ? [["Runs", containing.map(([first, last]) => `${first} to ${last}`).join("; ")]] : []), ...adjacent.map(row)];
 }
 
-/** The command that submits the same job again. */
+/** The commands that submit the same job again. */
 function repeat(found) {
   const last = found.snapshots.first + found.snapshots.count - 1;
   const body = {
@@ -130,5 +130,7 @@ function repeat(found) {
     announce("Command copied");
   });
   if (!navigator.clipboard) copy.hidden = true;
-  return h("details", null, h("summary", null, "Repeat this job"), h("pre", { tabindex: 0, class: "line" }, text), copy);
+  const anywhere = found.state === "succeeded" && h("p", { class: "muted below" }, "On a service without the measurement: download the ",
+    h("a", { href: `/v1/jobs/${found.id}/exports/manifest`, download: "manifest.json" }, "manifest of the job"), ", and run ", h("code", null, "sci-recon submit --manifest manifest.json"), " with the files that it asks for.");
+  return h("details", null, h("summary", null, "Repeat this job"), h("pre", { tabindex: 0, class: "line" }, text), copy, anywhere);
 }

@@ -1,6 +1,6 @@
 // Questions that mend a refusal or a finding: for each setting that it names, the controls that state it.
 
-import { h } from "./dom.js";
+import { h, place } from "./dom.js";
 
 const SCALES = [1, 255, 1023, 4095, 16383, 65535];
 /** Names of the axis orders. */
@@ -29,10 +29,16 @@ function askAxes(error, again) {
   return ask("Axes", ambiguous ? "What is the order of the array’s axes?" : "Or is the order of the array’s axes another one?", fit.map(([name, words]) => answer(words, () => again(name))));
 }
 
-/** Asks for the array, among those that the error names. */
-function askArray(error, again) {
-  const names = [...error.message.replace(/^.*it contains/, "").matchAll(/'([^']+)'/g)].map(([, name]) => name);
-  return names.length > 0 && ask("Array", "Which array of the file is it?", names.map((name) => answer(name, () => again(name))));
+/** Asks for the array of an uploaded file, among those that the error names; each has its size and first picture. */
+function askArray(error, file, again) {
+  const arrays = [...error.message.replace(/^.*it contains/, "").matchAll(/'([^']+)'(?: \(([\dx]+)\))?/g)];
+  const choice = ([, name, size]) => {
+    const picture = h("img", { src: place(`/view/blobs/${file}/pictures/array-${encodeURIComponent(name)}?size=96`), alt: "", width: 72, height: 72 });
+    // Some arrays, such as lists of numbers, have no picture.
+    picture.addEventListener("error", () => picture.replaceWith(h("span", { class: "blank" })));
+    return h("button", { type: "button", class: "arraychoice", onclick: () => again(name) }, picture, h("b", null, name), " ", h("span", { class: "muted" }, size?.replaceAll("x", " × ")));
+  };
+  return arrays.length > 0 && ask("Array", "Which array of the file is it?", arrays.map(choice));
 }
 
 /** Settings that an error names: by a JSON pointer, or in backticks in its text. */
@@ -42,12 +48,12 @@ function named(error) {
 }
 
 /**
- * Asks for the settings that an error names; null if it names none. `again(stated)` repeats the request with those `stated`
- * before and the new one. `more` has questions for further settings: functions by name that receive the error.
+ * Asks for the settings that an error of an uploaded `file` names; null if it names none. `again(stated)` repeats the request
+ * with those `stated` before and the new one. `more` has questions for further settings: functions by name that receive the error.
  */
-export function askAbout(error, stated, again, more = {}) {
+export function askAbout(error, file, stated, again, more = {}) {
   const set = (name) => (value) => again({ ...stated, [name]: value });
-  const questions = { array: () => askArray(error, set("array")), full_scale: () => askScale(set("full_scale")), ...more, axes: () => askAxes(error, set("axes")) };
+  const questions = { array: () => askArray(error, file, set("array")), full_scale: () => askScale(set("full_scale")), ...more, axes: () => askAxes(error, set("axes")) };
   const names = named(error);
   const asked = Object.entries(questions).filter(([name]) => names.has(name)).map(([, question]) => question(error)).filter(Boolean);
   return asked.length > 0 ? asked : null;

@@ -7,7 +7,7 @@ import { bytes, exact, figure, roughly } from "./format.js";
 import { Captures } from "./captures.js";
 import { findings, grade } from "./report.js";
 import { create, isAborted, get, send } from "./api.js";
-import { dispersionFields, given, numberField, partFields, shiftFields, textField } from "./fields.js";
+import { dispersionFields, furtherFields, given, numberField, partFields, shiftFields, textField } from "./fields.js";
 import { glance } from "./calibrations.js";
 
 const HINT = "npy, npz, TIFF, PNG, .mat, HDF5, or a ZIP archive of images";
@@ -25,6 +25,7 @@ export async function submit(root, [query], signal) {
   const changed = () => {
     button.disabled = !form.measurement;
     job.renew();
+    if (form.measurement) job.offer().catch((error) => isAborted(error) || put(result, problem(error)));
   };
   const measurement = measurementStep(form, changed, signal);
   const calibration = calibrationStep(form, known.items.filter((item) => item.state === "ready"), measurement.wake, query.get("calibration"), signal);
@@ -161,7 +162,7 @@ function masks(settings, use, verdict, signal) {
     } catch (error) {
       if (isAborted(error)) throw error;
       const again = (next) => make(sha256, next).catch((later) => put(verdict, problem(later)));
-      put(verdict, problem(error), askAbout(error, stated, again, { frames: () => askFrames(error, part, repeat) }));
+      put(verdict, problem(error), askAbout(error, sha256, stated, again, { frames: () => askFrames(error, part, repeat) }));
     }
   };
   const drop = dropZone("masks", "Calibration set", `one mask per frame, or the only mask of a spectral camera: ${HINT}`, signal, (blob) => make(blob.sha256, {}));
@@ -255,13 +256,15 @@ function measurementStep(form, changed, signal) {
       if (mine !== attempt) return;
       if (isAborted(error)) throw error;
       const repeat = () => again(known);
-      put(verdict, problem(error), askAbout(error, stated, again, {
+      put(verdict, problem(error), askAbout(error, sha256, stated, again, {
         crop: () => askWindow(error, form, part, repeat),
         mask: () => askExtent(form),
       }));
       return;
     }
-    const doubt = form.measurement.warnings.some((item) => item.code === "level") && askScale((full_scale) => again({ ...stated, full_scale }));
+    const scale = askScale((full_scale) => again({ ...stated, full_scale }));
+    const isDoubtful = form.measurement.warnings.some((item) => item.code === "level");
+    const doubt = isDoubtful ? scale : h("details", null, h("summary", null, `Full scale of the measurement: ${exact(form.measurement.full_scale)}`), scale);
     put(verdict, fits(form.measurement), doubt, askMove(form, part, () => again(known)));
     changed();
   };
@@ -298,7 +301,6 @@ function fits(item) {
     facts([
       ["Snapshots", `${item.snapshots} of ${item.height} × ${item.width}, ${item.sample} in ${item.format}`],
       item.snapshots > 1 && ["Sequence", item.sequence === "contiguous" ? "consecutive, reconstructed jointly where that reduces the error" : "independent snapshots"],
-      ["Full scale", exact(item.full_scale)],
     ]),
   ];
 }
@@ -310,11 +312,11 @@ function jobStep(algorithms, form, signal) {
   const priority = numberField("priority", "Priority, −100 to 0", 1);
   const plan = h("p", { class: "muted" });
   const estimate = h("div", { class: "estimate", "aria-live": "polite" });
-  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: truth.value(), registration: registration.value() }) });
+  const request = () => ({ measurement: form.measurement?.id, algorithm: select.value, ...given({ label: label.value(), priority: priority.value(), truth: truth.value(), registration: registration.value() }), ...further.value() });
   const ask = calmly(250, async () => {
     if (!form.measurement || signal.aborted) return;
-    const asked = JSON.stringify(request());
     try {
+      const asked = JSON.stringify(request());
       const found = await send("POST", "/v1/jobs/estimate", request());
       if (form.measurement && JSON.stringify(request()) === asked) put(estimate, costs(found));
     } catch (error) {
@@ -327,12 +329,17 @@ function jobStep(algorithms, form, signal) {
     if (!form.measurement) put(estimate, h("p", { class: "muted" }, "Time, memory and disk are estimated when the measurement is accepted."));
     ask();
   };
+  const further = furtherFields(() => renew());
+  const offer = async () => {
+    const { items } = await get(`/v1/models?calibration=${form.calibration.id}`, signal);
+    further.offer(items);
+  };
   const truth = optionalFile("truth", "True frames", "Optional: the scene’s frames, if they are known. They measure the quality of the result.", signal, () => ask());
   select.addEventListener("change", renew);
   priority.input.addEventListener("change", renew);
-  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, registration.elements, priority.element), plan, truth.element);
+  const element = step(3, "Reconstruction", h("div", { class: "fields" }, h("label", { for: "algorithm" }, "Algorithm", select), label.element, registration.elements, priority.element), plan, further.element, truth.element);
   queueMicrotask(renew);
-  return { element, estimate, renew, request };
+  return { element, estimate, renew, request, offer };
 }
 
 /** Estimated time, computation, memory and disk space of a job. */

@@ -21,7 +21,8 @@ use engine::intake::IntakeError;
 use engine::job::{CalibrationId, JobId, Lab, MeasurementId, SceneShape, Sha256};
 use engine::pipeline::derived::STACK;
 use engine::pipeline::records::TileTaskRecord;
-use formats::{self, Channels, FormatError};
+use formats::mat::SceneArray;
+use formats::{self, Channels, FormatError, Wanted};
 use store::{Calibration, Job, Measurement, StoreError, TileResult};
 
 /// The name of a picture of a job's snapshot.
@@ -44,10 +45,15 @@ enum JobPicture {
     Slice(usize),
 }
 
-/// The name of a picture of an uploaded file: `frame-N`, from 1.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+/// The name of a picture of an uploaded file.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
-struct BlobPicture(usize);
+enum BlobPicture {
+    /// `frame-N`, from 1.
+    Frame(usize),
+    /// `array-NAME`: the first frame of an array in a file of several.
+    Array(String),
+}
 
 /// The name of a picture of a measurement: `snapshot-N`, from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -96,7 +102,11 @@ impl TryFrom<String> for BlobPicture {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
-        numbered(&text, "frame").map(Self).ok_or_else(|| "pictures are frame-N".into())
+        if let Some(name) = text.strip_prefix("array-") {
+            return Ok(Self::Array(name.to_owned()));
+        }
+        let frame = numbered(&text, "frame").map(Self::Frame);
+        frame.ok_or_else(|| "pictures are frame-N and array-NAME".into())
     }
 }
 
@@ -195,19 +205,32 @@ impl Named for OfJob {
 
 impl Named for OfBlob {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
-        let Self { sha256, picture: BlobPicture(frame) } = self;
+        let Self { sha256, picture } = self;
         app.store.upload(lab, sha256).await?;
         let path = intake::upload(app, sha256).await?;
-        let (limits, file) = (app.limits, path.clone());
-        let read_info = move || formats::open_shown(&file, &limits).map(|reader| *reader.info());
+        let limits = app.limits;
+        let (frame, name) = match picture {
+            BlobPicture::Frame(frame) => (frame, None),
+            BlobPicture::Array(name) => (1, Some(name)),
+        };
+        let identity = format!("{sha256} sent {frame} {}", name.as_deref().unwrap_or_default());
+        let open = move || match &name {
+            None => formats::open_shown(&path, &limits),
+            Some(name) => {
+                let wanted = Wanted { name: Some(name.as_str()), ..SceneArray::Masks.into() };
+                formats::open_array(&path, wanted, &limits)
+            }
+        };
+        let again = open.clone();
+        let read_info = move || open().map(|reader| *reader.info());
         let info = tokio::task::spawn_blocking(read_info).await;
         let info = info.map_err(|error| ApiError::internal(&error))??;
         if !(1..=info.frames).contains(&frame) {
             return Err(not_found(format!("frames are counted from 1 to {}", info.frames)));
         }
-        let (identity, size) = (format!("{sha256} sent {frame}"), (info.height, info.width));
+        let size = (info.height, info.width);
         Ok(sent_frame(identity, size, Channels::Grey, move || {
-            let mut reader = formats::open_shown(&path, &limits)?;
+            let mut reader = again()?;
             nth_frame(frame, || reader.next_frame())
         }))
     }

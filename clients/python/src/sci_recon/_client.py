@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import os
 import time
 import uuid
@@ -327,6 +328,54 @@ class Client:
             ),
         )
 
+    def repeat(
+        self,
+        manifest: Record | str | os.PathLike[str],
+        files: Sequence[str | os.PathLike[str]] = (),
+        *,
+        priority: int = 0,
+        label: str | None = None,
+        webhook: str | None = None,
+        key: str | None = None,
+    ) -> Job:
+        """Repeats the job of a manifest, with the same calibration, measurement and settings.
+
+        `manifest` is `Result.manifest`, or the manifest.json of a job. `files` are the inputs that the service lacks, in any
+        order. Raises `ValueError` with the hashes of those that are missing. `Job.differences` compares the frames.
+        """
+        whole = read_manifest(manifest)
+        requests, run = whole["content"]["requests"], whole["run"]
+        held = {transfer.sha256(Path(file)): file for file in files}
+        network = whole["content"]["models"][0]["sha256"] if run["model"] else None
+        inputs = {"calibration": dict(hashes(requests["calibration"], "masks"))}
+        inputs["measurement"] = dict(hashes(requests["measurement"], "measurement"))
+        inputs["model"] = {network: "network"} if network else {}
+        ready = {kind: bool(run[kind]) and self._exists(f"/v1/{kind}s/{run[kind]}") for kind in inputs}
+        missing = []
+        if not ready["calibration"] and not {"masks", "captures"} & requests["calibration"].keys():
+            missing.append(f"calibration {run['calibration']}, which only the service that moved its masks has")
+        for kind, of_kind in inputs.items():
+            for sha256, role in of_kind.items():
+                if ready[kind]:
+                    continue
+                if sha256 in held:
+                    self.upload(held[sha256])
+                elif not self._exists(f"/v1/blobs/{sha256}"):
+                    missing.append(f"{role} with the SHA-256 {sha256}")
+        if missing:
+            raise ValueError(f"the service lacks inputs of the manifest: {'; '.join(missing)}. Add their files")
+        calibration, measurement, job = run["calibration"], run["measurement"], dict(requests["job"])
+        if not ready["calibration"]:
+            calibration = Calibration(self, self._create("calibrations", **requests["calibration"])).ready().id
+        if not ready["measurement"]:
+            body = {**requests["measurement"], "calibration": calibration}
+            measurement = Measurement(self, self._create("measurements", key=key, **body)).ready().id
+        if network:
+            model = None if ready["model"] else self._create("models", key=key, calibration=calibration, file=network)
+            job["model"] = model["id"] if model else run["model"]
+        own = {"priority": priority, "label": label or run["label"], "webhook": webhook}
+        return Job(self, self._create("jobs", key=key, measurement=measurement, **job, **own))
+
     def calibration(self, identifier: str) -> Calibration:
         """An existing calibration, created by this client or another."""
         return Calibration(self, self._get(f"/v1/calibrations/{identifier}"))
@@ -360,6 +409,14 @@ class Client:
     def _get(self, path: str, **parameters: Any) -> Record:
         record: Record = transfer.send(self.http, "GET", path, params=parameters).json()
         return record
+
+    def _exists(self, path: str) -> bool:
+        try:
+            return bool(self._get(path).get("state", "ready") == "ready")
+        except ApiError as error:
+            if error.status == 404:
+                return False
+            raise
 
     def _get_waiting(self, path: str, wait: float) -> Record:
         """Gets a record. The service answers once the work has ended, or after `wait` seconds."""
@@ -535,6 +592,12 @@ class Job(Entity):
         """Deletes the job and its results."""
         transfer.send(self.client.http, "DELETE", f"/v1/jobs/{self.id}")
 
+    def differences(self, manifest: Record | str | os.PathLike[str]) -> list[int]:
+        """The snapshots with other frames than those of a manifest: none if the job repeats it exactly."""
+        whole = self.client._get(f"/v1/jobs/{self.id}/exports/manifest")
+        mine, other = frames_of(whole), frames_of(read_manifest(manifest))
+        return sorted(index for index in mine.keys() | other.keys() if mine.get(index) != other.get(index))
+
     def result(self, folder: str | os.PathLike[str] | None = None) -> Result:
         """The results of the job. Files are downloaded on first use into `folder`, by default a temporary folder.
 
@@ -662,6 +725,32 @@ class Result:
     def manifest(self) -> Record:
         """The manifest of the job: inputs, parameters and results."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
+
+
+def read_manifest(manifest: Record | str | os.PathLike[str]) -> Record:
+    """The manifest of a job. Raises `ValueError` for other files."""
+    whole: Record = dict(manifest) if isinstance(manifest, Mapping) else json.loads(Path(manifest).read_bytes())
+    if whole.get("schema") != "sci-recon/job/1" or "requests" not in whole["content"]:
+        raise ValueError("this is not the manifest.json of a job, or an earlier version has written it")
+    return whole
+
+
+def frames_of(manifest: Record) -> dict[int, str]:
+    """The hash of the frames of each snapshot."""
+    files = ((entry["snapshot"], file) for entry in manifest["content"]["snapshots"] for file in entry["files"])
+    return {snapshot: file["sha256"] for snapshot, file in files if file["name"] == "frames.npy"}
+
+
+def hashes(value: Any, role: str) -> Iterator[tuple[str, str]]:
+    """The uploads that a request names, with their roles."""
+    if isinstance(value, str) and len(value) == 64:
+        yield value, role
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            yield from hashes(part, role if name in ("masks", "data") else f"{name.replace('_', ' ')} of the {role}")
+    elif isinstance(value, list):
+        for part in value:
+            yield from hashes(part, role)
 
 
 def sheared(mask: npt.NDArray[Any], dispersion: Record, size: tuple[int, int]) -> npt.NDArray[np.float64]:

@@ -10,6 +10,7 @@ mod model;
 mod pool;
 mod reading;
 mod registration;
+mod repetition;
 mod report;
 mod request;
 mod shape;
@@ -33,6 +34,7 @@ pub use pool::Pool;
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
 pub use registration::{Registered, RegistrationRequest};
+pub use repetition::Repetition;
 pub use report::{
     CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, Severity,
 };

@@ -12,8 +12,8 @@ use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, TileRecord};
 use crate::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
-    MeasurementId, ModelRecord, Mosaic, Registered, ResultFile, SceneShape, Schedule, Sha256,
-    TaskKind,
+    MeasurementId, ModelId, ModelRecord, Mosaic, Registered, Repetition, ResultFile, SceneShape,
+    Schedule, Sha256, TaskKind,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -172,7 +172,7 @@ impl Recipe {
 
     /// The manifest of a job, from the records of its tasks.
     pub fn job(self, job: JobId, spec: &JobSpec, tasks: JobTasks) -> JobManifest {
-        let JobTasks { snapshots, seconds, attempts } = tasks;
+        let JobTasks { requests, snapshots, seconds, attempts } = tasks;
         let cost = CostRecord::sum(snapshots.iter().map(|(_, record)| &record.run.cost));
         let mut seconds_by_task = BTreeMap::new();
         for (kind, seconds) in &seconds {
@@ -187,13 +187,14 @@ impl Recipe {
         let snapshots = snapshots.into_iter().map(entry).collect();
         JobManifest {
             schema: JOB_SCHEMA,
-            content: JobContent { shape: self.shape, recipe: self, snapshots },
+            content: JobContent { requests, shape: self.shape, recipe: self, snapshots },
             run: JobRun {
                 run: RunRecord::ended(Some(job.to_string()), cost, None),
                 label: spec.label.clone(),
                 truth_sha256: spec.truth,
                 calibration: spec.calibration,
                 measurement: spec.measurement,
+                model: spec.model.as_ref().map(|model| model.id),
                 tasks: seconds.len() + 1,
                 attempts,
                 seconds_by_task,
@@ -205,6 +206,8 @@ impl Recipe {
 /// The records of all tasks of a job except that of the manifest.
 #[derive(Debug, Clone)]
 pub struct JobTasks {
+    /// The requests that repeat the job.
+    pub requests: Repetition,
     /// The assembled snapshots, each with its index in the measurement.
     pub snapshots: Vec<(u32, SnapshotRecord)>,
     /// Seconds that each task took.
@@ -321,6 +324,8 @@ pub struct JobManifest {
 struct JobContent {
     #[serde(flatten)]
     recipe: Recipe,
+    /// The requests that repeat the job.
+    requests: Repetition,
     shape: SceneShape,
     snapshots: Vec<SnapshotEntry>,
 }
@@ -343,6 +348,8 @@ struct JobRun {
     truth_sha256: Option<Sha256>,
     calibration: CalibrationId,
     measurement: MeasurementId,
+    /// The model of algorithm `learned`; null for others.
+    model: Option<ModelId>,
     /// Number of tasks.
     tasks: usize,
     /// Number of times that workers have claimed a task.

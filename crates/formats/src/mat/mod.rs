@@ -60,7 +60,7 @@ pub(super) fn open(
                 MatSamples::new((content, again), (element, order), (scene, expected), limits)?;
             return Ok(Box::new(ArrayReader::new(samples, info, layout)));
         }
-        present.push(header.name);
+        present.push((header.name, header.dimensions));
     }
     let (format, name) = (Format::Mat, name.to_owned());
     Err(FormatError::MissingArray { format, name, present: list(&present) })

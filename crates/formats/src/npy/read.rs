@@ -62,6 +62,13 @@ pub(crate) fn open<R: Restart>(
     Ok(ArrayReader::new(samples, info, arranged.layout))
 }
 
+/// The shape in the header of an npy file of `length` bytes, which is positioned at its start.
+///
+/// Errors: those of reading a header.
+pub(crate) fn shape(mut file: impl Read, length: u64) -> Result<Vec<u64>> {
+    Ok(read_header(&mut file, length)?.0.shape)
+}
+
 /// Opens a colour clip (frame, row, column, 3) in C order; `None` for another shape.
 pub(crate) fn open_colours<R: Restart>(
     mut file: R,

@@ -49,7 +49,7 @@ fn arrays_are_read_by_name() {
         assert_eq!(read(&bytes, SceneArray::Measurements, None).unwrap(), snapshots);
         assert_eq!(read(&bytes, SceneArray::Masks, Some("meas")).unwrap(), snapshots);
         let missing = read(&bytes, SceneArray::Truth, None).unwrap_err().to_string();
-        assert_names(&missing, &["npz", "'orig'", "'meas', 'mask'"]);
+        assert_names(&missing, &["npz", "'orig'", "'meas' (2x4x5), 'mask' (3x4x5)"]);
         assert_names(&refusal(&bytes), &["'meas.npy', 'mask.npy'", "save the array alone"]);
         // The only array needs no name, and a clip may be called frames.
         let only = archive(&[("arr_0.npy", array(&masks))], options);
