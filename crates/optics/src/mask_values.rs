@@ -147,28 +147,28 @@ fn slope(strips: &[Strip], fit: &Fit, weights: &[Array1<f64>]) -> f64 {
 /// Residual of the plainest tenth of the blocks, relative to the energy of one mask there, and the energy of all masks
 /// relative to that of their sum.
 fn plainest_blocks(strips: &[Strip], fit: &Fit) -> (f64, f64) {
-    let (mut of_masks, mut of_sum, mut pixels) = (0.0, 0.0, 0.0);
+    let (mut mask_energy, mut sum_energy, mut pixels) = (0.0, 0.0, 0.0);
     for strip in strips {
         let energy = |values: ndarray::ArrayView1<'_, f32>| {
             values.iter().map(|value| f64::from(*value).powi(2)).sum::<f64>()
         };
         let masks = strip.masks.outer_iter().zip(&fit.brightness);
-        of_masks += masks.map(|(mask, x)| x * x * energy(mask)).sum::<f64>();
+        mask_energy += masks.map(|(mask, x)| x * x * energy(mask)).sum::<f64>();
         let predicted = fit.brightness.mapv(|value| value as f32).dot(&strip.masks);
-        of_sum += energy(predicted.view());
+        sum_energy += energy(predicted.view());
         pixels += strip.y.len() as f64;
     }
-    let of_mask = of_masks / pixels / fit.brightness.len().max(1) as f64;
+    let energy_per_mask = mask_energy / pixels / fit.brightness.len().max(1) as f64;
     let mut residuals = Vec::new();
     for strip in strips {
         let squares = strip.squared_residuals(&fit.brightness);
         for (block, square) in squares.iter().enumerate() {
             let light = strip.mask_means.column(block).dot(&fit.brightness);
             let factor = (strip.y_means[block] / light).max(0.1);
-            residuals.push(square / (of_mask * factor * factor).max(f64::MIN_POSITIVE));
+            residuals.push(square / (energy_per_mask * factor * factor).max(f64::MIN_POSITIVE));
         }
     }
     residuals.sort_by(f64::total_cmp);
     let plainest = residuals.get(residuals.len() / 10).copied().unwrap_or_default();
-    (plainest, if of_sum > 0.0 { of_masks / of_sum } else { 0.0 })
+    (plainest, if sum_energy > 0.0 { mask_energy / sum_energy } else { 0.0 })
 }

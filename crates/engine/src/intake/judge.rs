@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use ndarray::{Array2, Array3, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use crate::job::{Dispersion, DispersionAxis, Finding, FindingCode, Mosaic};
 use formats::planar::Reader;
@@ -101,16 +101,17 @@ pub fn judge(
         }
         let number = u32::try_from(snapshot).ok();
         let mut judged = judge_measurement(&figures, dark_subtracted);
-        let explained = [FindingCode::InvertedMasks, FindingCode::ResampledMasks];
+        let explained =
+            [FindingCode::InvertedMasks, FindingCode::ResampledMasks, FindingCode::ShiftedMasks];
         // Masks at another place explain some of the light by chance, above all in small pictures.
         if mosaic.is_none()
             && !figures.is_flat
             && figures.explained_unshifted < MIN_EXPLAINED
             && !judged.iter().any(|finding| explained.contains(&finding.code))
             && let Some(misplaced) = misplaced_masks((&masks, &snapshots), snapshot, &figures)?
+            && (dispersion.is_none() || Dispersion::admits(misplaced.code))
         {
-            use FindingCode::{DriftedMasks, ForeignMasks, ShiftedMasks};
-            let places = [DriftedMasks, ForeignMasks, ShiftedMasks];
+            let places = [FindingCode::DriftedMasks, FindingCode::ForeignMasks];
             judged.retain(|finding| !places.contains(&finding.code));
             judged.insert(0, misplaced);
         }
@@ -199,13 +200,50 @@ fn misplaced_masks(
     snapshot: usize,
     given: &MeasurementFigures,
 ) -> Result<Option<optics::Finding>, FormatError> {
-    let searches = [displaced_masks, turned_masks, magnified_masks];
-    for search in searches {
-        if let Some(found) = search(files, snapshot, given)? {
-            return Ok(Some(found));
+    // Each search finds something by chance in a small picture, so the one that explains most decides.
+    let mut best: Option<Misplaced> = None;
+    for search in [displaced_masks, turned_masks, magnified_masks] {
+        let found = search(files, snapshot, given)?;
+        if let Some(found) = found.filter(|found| found.is_better_than(given))
+            && best.as_ref().is_none_or(|best| found.explained > best.explained)
+        {
+            best = Some(found);
         }
     }
-    Ok(None)
+    Ok(best.map(|best| best.finding))
+}
+
+/// Masks that fit after a change.
+struct Misplaced {
+    /// Share of the fine structure that a fit of all frames explains then.
+    explained: f64,
+    finding: optics::Finding,
+}
+
+impl Misplaced {
+    fn is_better_than(&self, given: &MeasurementFigures) -> bool {
+        self.explained > MIN_EXPLAINED
+            && self.explained > MISPLACED_GAIN * given.explained_unshifted
+    }
+}
+
+/// Share of the fine structure of `y` \[H,W\] that `masks` \[B,H,W\] explain when they are moved by a displacement.
+fn explained_after(
+    masks: ArrayView3<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    displacement: &Displacement,
+) -> f64 {
+    let cut = |length: usize, moved: i32| {
+        let by = (moved.unsigned_abs() as usize).min(length);
+        let (early, late) = (0..length - by, by..length);
+        if moved > 0 { (early, late) } else { (late, early) }
+    };
+    let (frames, height, width) = masks.dim();
+    let (mask_rows, y_rows) = cut(height, displacement.rows);
+    let (mask_columns, y_columns) = cut(width, displacement.columns);
+    let mut study = MeasurementStudy::new(frames);
+    study.add(masks.slice(s![.., mask_rows, mask_columns]), y.slice(s![y_rows, y_columns]), (0, 0));
+    study.finish().map_or(0.0, |figures| figures.explained)
 }
 
 /// Looks for a displacement by more pixels than a fit of the frames covers, as after a wrong crop.
@@ -213,7 +251,7 @@ fn displaced_masks(
     (masks, snapshots): (&Reader, &Reader),
     snapshot: usize,
     given: &MeasurementFigures,
-) -> Result<Option<optics::Finding>, FormatError> {
+) -> Result<Option<Misplaced>, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
     let reach = LARGEST_DISPLACEMENT.min(height.min(width) / 4);
     let side = WINDOW + 2 * reach;
@@ -221,21 +259,22 @@ fn displaced_masks(
     let (rows, columns) = (window(height), window(width));
     let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
     let band = masks.read_window(0..frames, rows, columns)?;
-    let light = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0));
-    let found = displacement(light.view(), filled(y.index_axis(Axis(0), 0)).view(), reach);
-    let right = found.filter(|found| {
-        found.explained > MIN_EXPLAINED
-            && found.explained > MISPLACED_GAIN * given.explained_unshifted
-    });
-    Ok(right.map(|Displacement { rows, columns, explained }| {
+    let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+    let y = filled(y.index_axis(Axis(0), 0));
+    let found = displacement(band.sum_axis(Axis(0)).view(), y.view(), reach);
+    let found = found.filter(|found| found.explained > MIN_EXPLAINED);
+    Ok(found.map(|found| {
+        let explained = explained_after(band.view(), y.view(), &found);
         let detail = format!(
-            "the masks explain {:.0} % of the fine structure of the measurement when shifted by {rows} rows and \
-             {columns} columns, but only {:.1} % without a shift. The measurement is probably a crop that begins at \
-             another place than the masks",
+            "the masks explain {:.0} % of the fine structure of the measurement when shifted by {} rows and {} columns, \
+             but only {:.1} % without a shift. The measurement is probably a crop that begins at another place than the \
+             masks",
             100.0 * explained,
+            found.rows,
+            found.columns,
             100.0 * given.explained_unshifted
         );
-        optics::Finding::new(FindingCode::ShiftedMasks, detail)
+        Misplaced { explained, finding: optics::Finding::new(FindingCode::ShiftedMasks, detail) }
     }))
 }
 
@@ -247,7 +286,7 @@ fn magnified_masks(
     (masks, snapshots): (&Reader, &Reader),
     snapshot: usize,
     given: &MeasurementFigures,
-) -> Result<Option<optics::Finding>, FormatError> {
+) -> Result<Option<Misplaced>, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
     let window = |length: usize| {
         let side = length.min(MAGNIFIED_WINDOW);
@@ -269,24 +308,8 @@ fn magnified_masks(
     let views: Vec<_> = enlarged.iter().map(|mask| mask.view()).collect();
     let Ok(enlarged) = ndarray::stack(Axis(0), &views) else { return Ok(None) };
     let y = central(y.view(), size);
-    // Both are cut so that the masks are moved by the displacement.
-    let cut = |length: usize, moved: i32| {
-        let by = moved.unsigned_abs() as usize;
-        let (early, late) = (0..length - by, by..length);
-        if moved > 0 { (early, late) } else { (late, early) }
-    };
-    let (mask_rows, y_rows) = cut(size.0, displacement.rows);
-    let (mask_columns, y_columns) = cut(size.1, displacement.columns);
-    let mut study = MeasurementStudy::new(frames);
-    study.add(
-        enlarged.slice(s![.., mask_rows, mask_columns]),
-        y.slice(s![y_rows, y_columns]),
-        (0, 0),
-    );
-    let explained = study.finish().map_or(0.0, |figures| figures.explained);
-    let is_right =
-        explained > MIN_EXPLAINED && explained > MISPLACED_GAIN * given.explained_unshifted;
-    Ok(is_right.then(|| {
+    let explained = explained_after(enlarged.view(), y, &displacement);
+    Ok(Some({
         let change = match factor > 1.0 {
             true => format!("enlarged by a factor of about {factor:.2}"),
             false => format!("reduced by a factor of about {:.2}", factor.recip()),
@@ -298,7 +321,7 @@ fn magnified_masks(
             100.0 * explained,
             100.0 * given.explained_unshifted
         );
-        optics::Finding::new(FindingCode::ResampledMasks, detail)
+        Misplaced { explained, finding: optics::Finding::new(FindingCode::ResampledMasks, detail) }
     }))
 }
 
@@ -307,7 +330,7 @@ fn turned_masks(
     files: (&Reader, &Reader),
     snapshot: usize,
     given: &MeasurementFigures,
-) -> Result<Option<optics::Finding>, FormatError> {
+) -> Result<Option<Misplaced>, FormatError> {
     let (height, width) = (files.0.info().height, files.0.info().width);
     let mut best: Option<(f64, Turn)> = None;
     for turn in Turn::others(height, width) {
@@ -317,10 +340,7 @@ fn turned_masks(
             best = Some((explained, turn));
         }
     }
-    let right = best.filter(|(explained, _)| {
-        *explained > MIN_EXPLAINED && *explained > MISPLACED_GAIN * given.explained_unshifted
-    });
-    Ok(right.map(|(explained, turn)| {
+    Ok(best.map(|(explained, turn)| {
         let axes = if turn == (Turn { transposed: true, ..Turn::default() }) {
             ". The masks were probably read with a wrong order of axes: state `frame-column-row` as `axes` where \
              `frame-row-column` was taken, and the other way round"
@@ -334,7 +354,7 @@ fn turned_masks(
             turn.describe(),
             100.0 * given.explained_unshifted
         );
-        optics::Finding::new(FindingCode::TurnedMasks, detail)
+        Misplaced { explained, finding: optics::Finding::new(FindingCode::TurnedMasks, detail) }
     }))
 }
 
