@@ -228,7 +228,7 @@ impl MeasurementStudy {
                 };
                 for (k, mask) in masks.outer_iter().enumerate() {
                     for ((row, column), correlations) in shifts().zip(&mut part.correlations) {
-                        // The mask need not be block-centred: the sum of y' over a block is 0.
+                        // Centring the mask would change nothing: the sum of y' over a block is 0.
                         let shifted = mask.slice(s![
                             row + part_rows.start..row + part_rows.end,
                             column + part_columns.start..column + part_columns.end
