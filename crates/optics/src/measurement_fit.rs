@@ -108,8 +108,9 @@ fn weights(strips: &[Strip], brightness: &Array1<f64>) -> Vec<Array1<f64>> {
     residuals.iter().map(|residuals| residuals.mapv(weight)).collect()
 }
 
-/// Standard errors \[B\] of the brightness. Residuals of neighbouring pixels are correlated, so they come from the scatter
-/// between blocks (Liang and Zeger, Biometrika 1986).
+/// Standard errors \[B\] of the brightness: the larger of those from the scatter between blocks (Liang and Zeger, Biometrika
+/// 1986) and from that of the pixels. Residuals of neighbouring pixels are correlated, which the second ignores. The first is
+/// too small where the masks resemble one another so much that few blocks decide.
 pub(super) fn brightness_errors(
     strips: &[Strip],
     fit: &Fit,
@@ -128,7 +129,18 @@ pub(super) fn brightness_errors(
         }
         scatter += &scores.dot(&scores.t());
     }
-    fit.inverse.dot(&scatter).dot(&fit.inverse).diag().mapv(|variance| variance.max(0.0).sqrt())
+    let between_blocks = fit.inverse.dot(&scatter).dot(&fit.inverse);
+    let of_pixels = weighted_scatter(strips, &fit.brightness, weights);
+    let variances = between_blocks.diag().into_iter().zip(fit.inverse.diag());
+    variances.map(|(blocks, share)| blocks.max(of_pixels * share).max(0.0).sqrt()).collect()
+}
+
+/// Weighted mean squared residual of the blocks: the variance of a pixel in a block of weight 1.
+fn weighted_scatter(strips: &[Strip], brightness: &Array1<f64>, weights: &[Array1<f64>]) -> f64 {
+    let sums = strips.iter().zip(weights);
+    let sum: f64 =
+        sums.map(|(strip, weights)| strip.squared_residuals(brightness).dot(weights)).sum();
+    sum / weights.iter().map(Array1::len).sum::<usize>().max(1) as f64
 }
 
 /// Weighted sums over the blocks of a strip.
