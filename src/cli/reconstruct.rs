@@ -374,10 +374,14 @@ impl<'a> Input<'a> {
         if (rows, columns) != (height, width) {
             return Err(CliError::Input(format!(
                 "measurement {} is {rows}x{columns}, but the masks {} are {frames} frames of \
-                 {height}x{width}; both must have the same height and width: state the window that they have in \
-                 common as --masks-crop or --crop",
+                 {height}x{width}; both must have the same height and width: {}",
                 sources.measurement.path.display(),
                 sources.masks.path.display(),
+                intake::size_remedy(
+                    (height, width),
+                    (rows, columns),
+                    "state the window that they have in common as --masks-crop or --crop",
+                ),
             )));
         }
         let mosaic = arguments.mosaic;
@@ -409,6 +413,7 @@ impl<'a> Input<'a> {
         });
         let mut findings: Vec<Finding> = calibration.into_iter().collect();
         findings.extend(intake::combined(read.passed.findings, judged.collect()));
+        intake::causes_first(&mut findings);
         Ok(Self { sources, masks, measurement, first, truth, mosaic, findings, registration: None })
     }
 

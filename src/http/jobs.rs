@@ -16,6 +16,7 @@ use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Cursor, Limit, NoQuery, PageBody};
 use super::truth;
+use engine::intake;
 use engine::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
     JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Registered,
@@ -369,6 +370,7 @@ async fn resolve(app: &App, access: &Access, mut request: JobRequest) -> Result<
     spec.networks = networks.records(&spec.schedule);
     spec.warnings = report.and_then(|report| report.warning()).into_iter().collect();
     spec.warnings.extend(warnings_of(measurement.warnings, spec.snapshots));
+    intake::causes_first(&mut spec.warnings);
     check_memory(app, &spec)?;
     check_networks(app, &spec)?;
     check_webhook(app, &spec)?;

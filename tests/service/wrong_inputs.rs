@@ -2,8 +2,9 @@
 
 use std::process::Command;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 
+use crate::app::{TestApp, id};
 use crate::pipeline::values;
 use crate::samples::{Scene, npy};
 
@@ -14,22 +15,65 @@ const FRAMES: usize = 8;
 /// Masks, and a snapshot of a pattern that moves by 1.5 pixels a frame.
 fn scene() -> (Vec<f32>, Vec<f32>) {
     let masks = values(&Scene { frames: FRAMES, height: SIDE, width: SIDE, snapshots: 1 }.masks());
+    let y = snapshot(&masks);
+    (masks, y)
+}
+
+/// Masks with values between 0 and 1: an irregular pattern of 3x3 pixels, seen through four to six of nine openings.
+fn grey_masks() -> Vec<f32> {
+    let hash = |values: [usize; 2]| {
+        let mut state = 0x9E37_79B9_7F4A_7C15_u64;
+        for value in values {
+            state = (state ^ value as u64).wrapping_mul(0xD6E8_FEB8_6659_FD93);
+            state ^= state >> 32;
+        }
+        state
+    };
+    let pixel = |k: usize, row: usize, column: usize| {
+        let is_open = |opening: &usize| hash([100 + k, *opening]) % 9 < 5;
+        let open: Vec<usize> = (0..9).filter(is_open).collect();
+        let pattern = |opening: &usize| {
+            let place = [(row + 5 * (opening / 3)) / 3, (column + 7 * (opening % 3)) / 3];
+            f32::from(u8::from(hash(place) & 1 == 1))
+        };
+        open.iter().map(pattern).sum::<f32>() / open.len() as f32
+    };
+    let place = |at: usize| pixel(at / PIXELS, at % PIXELS / SIDE, at % SIDE);
+    (0..FRAMES * PIXELS).map(place).collect()
+}
+
+/// A snapshot of a moving pattern behind masks.
+fn snapshot(masks: &[f32]) -> Vec<f32> {
     let pixel = |k: usize, at: usize| {
         let (row, column) = ((at / SIDE) as f32, (at % SIDE) as f32 + 1.5 * k as f32);
         0.45 + 0.2 * (column * 0.2).sin() * (row * 0.15).cos()
             + 0.1 * (column * 0.31 + row * 0.27).sin()
     };
-    let y = |at: usize| (0..FRAMES).map(|k| masks[k * PIXELS + at] * pixel(k, at)).sum();
-    let y = (0..PIXELS).map(y).collect();
-    (masks, y)
+    let y = |at: usize| (0..masks.len() / PIXELS).map(|k| masks[k * PIXELS + at] * pixel(k, at));
+    (0..PIXELS).map(|at| y(at).sum()).collect()
+}
+
+/// Masks that are enlarged by a factor about the middle of the picture.
+fn enlarged(masks: &[f32], factor: f32) -> Vec<f32> {
+    let middle = (SIDE - 1) as f32 / 2.0;
+    let source = |at: usize| ((at as f32 - middle) / factor + middle).clamp(0.0, (SIDE - 1) as f32);
+    let pixel = |at: usize| {
+        let (row, column) = (source(at % PIXELS / SIDE), source(at % SIDE));
+        let (i, j) = ((row as usize).min(SIDE - 2), (column as usize).min(SIDE - 2));
+        let (down, right) = (row - i as f32, column - j as f32);
+        let value = |i: usize, j: usize| masks[at / PIXELS * PIXELS + i * SIDE + j];
+        (1.0 - down) * ((1.0 - right) * value(i, j) + right * value(i, j + 1))
+            + down * ((1.0 - right) * value(i + 1, j) + right * value(i + 1, j + 1))
+    };
+    (0..masks.len()).map(pixel).collect()
 }
 
 /// The assessment and the codes of the findings.
 fn reconstruct(masks: &[f32], y: &[f32]) -> (Value, Vec<String>) {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let masks = npy(&[FRAMES, SIDE, SIDE], masks.iter().copied());
-    std::fs::write(path("masks.npy"), masks).unwrap();
+    let shape = [masks.len() / PIXELS, SIDE, SIDE];
+    std::fs::write(path("masks.npy"), npy(&shape, masks.iter().copied())).unwrap();
     std::fs::write(path("y.npy"), npy(&[SIDE, SIDE], y.iter().copied())).unwrap();
     let output = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
         .args(["reconstruct", "--masks", "masks.npy", "--measurement", "y.npy", "--json"])
@@ -149,4 +193,104 @@ fn a_crop_that_begins_at_another_place_is_named() {
         assert_eq!(codes[0], "shifted_masks", "{rows} {columns}: {codes:?}");
         assert_eq!((&assessment["grade"], &assessment["psnr_db"]), (&"bad".into(), &Value::Null));
     }
+}
+
+#[test]
+fn resampled_masks_are_named_first() {
+    for masks in [scene().0, grey_masks()] {
+        let y = snapshot(&masks);
+        for factor in [1.01, 0.985, 1.05, 1.28, 0.8] {
+            let (assessment, codes) = reconstruct(&enlarged(&masks, factor), &y);
+            assert_eq!(codes[0], "resampled_masks", "{factor}: {codes:?}");
+            let is_bad = (&assessment["grade"], &assessment["psnr_db"]);
+            assert_eq!(is_bad, (&"bad".into(), &Value::Null));
+        }
+    }
+}
+
+#[test]
+fn altered_values_of_masks_are_named_before_the_dark() {
+    let masks = grey_masks();
+    let y = snapshot(&masks);
+    let (_, codes) = reconstruct(&masks, &y);
+    assert_eq!(codes, Vec::<String>::new());
+    let encoded = |value: f32| match value {
+        ..=0.003_130_8 => 12.92 * value,
+        _ => 1.055 * value.powf(1.0 / 2.4) - 0.055,
+    };
+    let picture = |value: &f32| (255.0 * encoded(*value)).round() / 255.0;
+    let pictures: Vec<f32> = masks.iter().map(picture).collect();
+    let binary: Vec<f32> = masks.iter().map(|mask| f32::from(u8::from(*mask > 0.5))).collect();
+    for masks in [pictures, binary] {
+        let (assessment, codes) = reconstruct(&masks, &y);
+        assert_eq!(codes[0], "mask_values", "{codes:?}");
+        assert_eq!(assessment["psnr_db"], Value::Null);
+    }
+    // A dark that is missing is no altered mask.
+    let lifted: Vec<f32> = y.iter().map(|y| y + 0.8).collect();
+    assert_eq!(reconstruct(&masks, &lifted).1[0], "no_dark");
+}
+
+#[tokio::test]
+async fn a_missing_mask_is_named_before_the_dark() {
+    for masks in [scene().0, grey_masks()] {
+        let y = snapshot(&masks);
+        for missing in [0, FRAMES / 2, FRAMES - 1] {
+            let mut fewer = masks.clone();
+            fewer.drain(missing * PIXELS..(missing + 1) * PIXELS);
+            let (assessment, codes) = reconstruct(&fewer, &y);
+            assert_eq!(codes[0], "missing_mask", "{missing}: {codes:?}");
+            assert_eq!(assessment["psnr_db"], Value::Null);
+        }
+    }
+    // The service has the same warning.
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (mut masks, y) = scene();
+    masks.truncate((FRAMES - 1) * PIXELS);
+    let calibration = app.calibrate(npy(&[FRAMES - 1, SIDE, SIDE], masks)).await.expect(201);
+    let data = app.upload(npy(&[SIDE, SIDE], y)).await;
+    let body = json!({"calibration": id(&calibration), "data": data});
+    let measurement = app.post("/v1/measurements", &body).await.expect(201).json();
+    assert_eq!(measurement["warnings"][0]["code"], "missing_mask", "{measurement:#}");
+}
+
+#[test]
+fn shuffled_masks_that_resemble_one_another_are_found_by_the_motion() {
+    let masks = grey_masks();
+    let y = snapshot(&masks);
+    let order = [3, 1, 6, 0, 7, 2, 5, 4];
+    let shuffled: Vec<f32> =
+        order.iter().flat_map(|k| masks[k * PIXELS..(k + 1) * PIXELS].to_vec()).collect();
+    let (assessment, codes) = reconstruct(&shuffled, &y);
+    assert_eq!(codes, ["exchanged_masks"]);
+    assert_eq!((&assessment["order"], &assessment["psnr_db"]), (&"doubtful".into(), &Value::Null));
+}
+
+#[tokio::test]
+async fn masks_of_another_size_get_the_likely_cause() {
+    let app = TestApp::start().await;
+    let scene = Scene { frames: 4, height: 48, width: 64, snapshots: 1 };
+    let calibration = id(&app.calibrate(scene.masks()).await.expect(201));
+    for (shape, cause) in [([64, 48], "90 degrees"), ([96, 128], "binned"), ([48, 96], "`packing`")]
+    {
+        let data = app.upload(npy(&shape, vec![1.0; shape[0] * shape[1]])).await;
+        let body = json!({"calibration": calibration, "data": data});
+        let refused = app.post("/v1/measurements", &body).await.problem(422, "size_mismatch");
+        assert!(refused.contains(cause), "{refused}");
+    }
+}
+
+#[test]
+fn a_small_bright_object_in_a_dark_scene_has_a_plausible_level() {
+    let (masks, _) = scene();
+    let pixel = |k: usize, at: usize| {
+        let (row, column) = ((at / SIDE) as f32 - 60.0, (at % SIDE) as f32 - 70.0 - k as f32);
+        if row.hypot(column) < 5.0 { 0.95 } else { 0.05 }
+    };
+    let y = |at: usize| (0..FRAMES).map(|k| masks[k * PIXELS + at] * pixel(k, at)).sum();
+    let y: Vec<f32> = (0..PIXELS).map(y).collect();
+    let (_, codes) = reconstruct(&masks, &y);
+    assert!(!codes.contains(&"level".to_owned()), "{codes:?}");
+    let tenth: Vec<f32> = y.iter().map(|y| 0.1 * y).collect();
+    assert!(reconstruct(&masks, &tenth).1.contains(&"level".to_owned()));
 }

@@ -280,19 +280,23 @@ impl Dispersion {
     /// offset that the masks do not explain.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
-            DeadPixels, ExchangedMasks, FastMotion, MissingPattern, NegativeOffset, NoDark,
-            OneDimensional, RepeatedPattern, StuckPixels, SwappedOrder, UnevenPatterns, WrongDark,
+            DeadPixels, ExchangedMasks, FastMotion, MaskValues, MissingMask, MissingPattern,
+            NegativeOffset, NoDark, OneDimensional, RepeatedPattern, ResampledMasks, StuckPixels,
+            SwappedOrder, UnevenPatterns, WrongDark,
         };
         !matches!(
             code,
             DeadPixels
                 | ExchangedMasks
                 | FastMotion
+                | MaskValues
+                | MissingMask
                 | MissingPattern
                 | NegativeOffset
                 | NoDark
                 | OneDimensional
                 | RepeatedPattern
+                | ResampledMasks
                 | StuckPixels
                 | SwappedOrder
                 | UnevenPatterns

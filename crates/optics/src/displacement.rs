@@ -5,7 +5,7 @@
 
 use ndarray::{Array2, ArrayView2, s};
 
-use super::measurement_check::{BLOCK, block_centred};
+use super::measurement_fit::{BLOCK, block_centred};
 
 /// The displacement (rows, columns) that fits best.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,6 +52,81 @@ pub fn displacement(
     let pixels = |index: usize| reach as i32 - index as i32;
     let explained = product.max(0.0).powi(2) / norm;
     Some(Displacement { rows: pixels(row), columns: pixels(column), explained })
+}
+
+/// The image \[H,W\] enlarged by a factor about its middle, by linear interpolation. A reduced image has a
+/// smaller size of the same parity. `None` if nothing is left.
+pub fn magnified(image: ArrayView2<'_, f32>, factor: f64) -> Option<Array2<f32>> {
+    let (height, width) = image.dim();
+    let kept = |length: usize| {
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // at most the length
+        let known = (length as f64 * factor.min(1.0)) as usize;
+        length - (length - known.min(length)).div_ceil(2) * 2
+    };
+    let (rows, columns) = (kept(height), kept(width));
+    if rows < BLOCK || columns < BLOCK {
+        return None;
+    }
+    let source = |at: usize, length: usize, kept: usize| {
+        let from_middle = at as f64 - (kept as f64 - 1.0) / 2.0;
+        let place =
+            (from_middle / factor + (length as f64 - 1.0) / 2.0).clamp(0.0, length as f64 - 1.0);
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // below the length
+        let first = (place as usize).min(length.saturating_sub(2));
+        (first, (place - first as f64) as f32)
+    };
+    Some(Array2::from_shape_fn((rows, columns), |(row, column)| {
+        let (i, down) = source(row, height, rows);
+        let (j, right) = source(column, width, columns);
+        let (below, beside) = ((i + 1).min(height - 1), (j + 1).min(width - 1));
+        let line = |row: usize| image[[row, j]] * (1.0 - right) + image[[row, beside]] * right;
+        line(i) * (1.0 - down) + line(below) * down
+    }))
+}
+
+/// The central part of an image with this size, which has the same parity.
+pub fn central(image: ArrayView2<'_, f32>, (height, width): (usize, usize)) -> ArrayView2<'_, f32> {
+    let (row, column) = ((image.nrows() - height) / 2, (image.ncols() - width) / 2);
+    image.slice_move(s![row..row + height, column..column + width])
+}
+
+/// The factor by which masks must be enlarged about the middle of the picture, with the displacement that remains.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Magnified {
+    /// The factor.
+    pub factor: f64,
+    /// The displacement after the magnification.
+    pub displacement: Displacement,
+}
+
+/// Largest and smallest factor that is searched, and the step between factors.
+const LARGEST_FACTOR: f64 = 2.1;
+const FACTOR_STEP: f64 = 1.015;
+/// Side of the compared centre. Half a step of the factor displaces its border by a third of a pixel.
+const COMPARED: usize = 96;
+/// Smallest side.
+const MIN_COMPARED: usize = 40;
+/// Largest displacement that is searched with each factor, in pixels.
+const MAGNIFIED_REACH: usize = 6;
+
+/// Searches the factor that fits the sum of the masks \[H,W\] to a measurement \[H,W\] best. `None` if the picture is too
+/// small.
+pub fn magnification(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> Option<Magnified> {
+    let steps = (LARGEST_FACTOR.ln() / FACTOR_STEP.ln()).ceil() as i32;
+    let found = (-steps..=steps).filter_map(|step| {
+        let factor = FACTOR_STEP.powi(step);
+        let light = magnified(light, factor)?;
+        let side = light.nrows().min(light.ncols()).min(COMPARED + 2 * MAGNIFIED_REACH);
+        if side < MIN_COMPARED + 2 * MAGNIFIED_REACH {
+            return None;
+        }
+        let same_parity = |length: usize| side - (length - side) % 2;
+        let size = (same_parity(light.nrows()), same_parity(light.ncols()));
+        let (light, y) = (central(light.view(), size).to_owned(), central(y, size));
+        let displacement = displacement(light.view(), y, MAGNIFIED_REACH)?;
+        Some(Magnified { factor, displacement })
+    });
+    found.max_by(|a, b| a.displacement.explained.total_cmp(&b.displacement.explained))
 }
 
 #[cfg(test)]

@@ -200,6 +200,17 @@ findings! {
         "the masks fit when they are flipped or their rows and columns exchanged",
         "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
          calibration again";
+    ResampledMasks: [Measurement], [Error],
+        "the masks have another magnification or rotation than the measurement",
+        "send masks and measurement in the pixels of the camera, without resizing; if neither was resized, calibrate again \
+         with the focus of the measurement";
+    MaskValues: [Measurement], [Error],
+        "the values of the masks are not their transmission",
+        "make the masks again from linear values of the camera: without gamma curve, contrast stretch or threshold";
+    MissingMask: [Measurement], [Warning],
+        "a mask is missing",
+        "send one mask for each frame of the exposure, in the order in which the patterns are shown; if none is missing, \
+         record the dark frames again";
     ForeignMasks: [Measurement], [Error],
         "the masks do not explain the measurement",
         "name the calibration that belongs to this measurement, or calibrate again";

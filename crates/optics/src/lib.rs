@@ -13,12 +13,15 @@ mod camera;
 mod defects;
 mod dispersion;
 mod displacement;
+mod distortion;
 mod finding;
 mod geometry;
 mod iid;
 mod lens;
+mod mask_values;
 mod masks;
 mod measurement_check;
+mod measurement_fit;
 mod mosaic;
 mod multiplex;
 mod order;
@@ -33,11 +36,13 @@ pub use calibration_check::{CaptureFigures, PatternFigures, judge_captures, judg
 pub use camera::{Camera, illumination};
 pub use defects::{Defects, judge_defects};
 pub use dispersion::{Dispersion, DispersionAxis, DispersionError, MAX_BANDS, MaskExtent};
-pub use displacement::{Displacement, displacement};
+pub use displacement::{Displacement, Magnified, central, displacement, magnification, magnified};
+pub use distortion::Distortion;
 pub use finding::{Entry, Finding, FindingCode, Severity, Subject};
 pub use geometry::Geometry;
 pub use iid::iid_masks;
 pub use lens::soften;
+pub use mask_values::Alteration;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
 pub use measurement_check::{
     BitUsage, MeasurementFigures, MeasurementStudy, PhaseDifference, REACH, judge_measurement,

@@ -12,6 +12,7 @@ use super::model_process::ModelCommand;
 use super::transport::{Check, TaskError};
 use engine::intake::{
     self, Behind, Exposure, IntakeError, Refusal, RefusalCode, Source, expected_size, plan,
+    size_remedy,
 };
 use engine::job::{
     CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Registered, Sequence,
@@ -296,9 +297,11 @@ impl Running<'_> {
         if (info.height, info.width) != (masks.height, masks.width) {
             let remedy = match &masks.dispersion {
                 Some(dispersion) => expected_size(dispersion, (masks.height, masks.width)),
-                None => "state the window that both have in common as `crop`, with the calibration if the masks are \
-                         larger"
-                    .to_owned(),
+                None => size_remedy(
+                    (masks.height, masks.width),
+                    (info.height, info.width),
+                    "state the window that both have in common as `crop`, with the calibration if the masks are larger",
+                ),
             };
             let detail = format!(
                 "the measurement is {}x{} (rows x columns), but the masks of calibration {} are {}x{}: {remedy}",

@@ -3,13 +3,14 @@
 use std::ops::Range;
 use std::path::Path;
 
-use ndarray::{Array3, Axis};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use crate::job::{Dispersion, DispersionAxis, Finding, FindingCode, Mosaic};
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use optics::{
-    Displacement, MeasurementFigures, MeasurementStudy, REACH, displacement, judge_measurement,
+    Displacement, Magnified, MeasurementFigures, MeasurementStudy, REACH, central, displacement,
+    judge_measurement, magnification, magnified,
 };
 use reconstruction::unmeasured::filled;
 
@@ -27,7 +28,8 @@ const SNAPSHOTS: usize = 8;
 pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding> {
     use FindingCode::{
         BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, InvertedMasks, Level, MaskScale,
-        NegativeOffset, NoDark, Saturated, ShiftedMasks, TurnedMasks, WrongDark,
+        MaskValues, MissingMask, NegativeOffset, NoDark, ResampledMasks, Saturated, ShiftedMasks,
+        TurnedMasks, WrongDark,
     };
     let is_one_of =
         |finding: &Finding, codes: &[FindingCode]| codes.iter().any(|code| finding.is(*code));
@@ -35,7 +37,15 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
         let found = findings.iter().filter(|finding| is_one_of(finding, codes));
         found.map(|finding| finding.snapshot).collect()
     };
-    let wrong_masks = [BinaryMeasurement, InvertedMasks, ShiftedMasks, TurnedMasks, ForeignMasks];
+    let wrong_masks = [
+        BinaryMeasurement,
+        InvertedMasks,
+        ResampledMasks,
+        ShiftedMasks,
+        TurnedMasks,
+        ForeignMasks,
+        MaskValues,
+    ];
     let with_wrong_masks = snapshots_with(&judged, &wrong_masks);
     let copies = snapshots_with(&judged, &[BinaryMeasurement]);
     read.retain(|finding| match finding {
@@ -46,7 +56,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
         _ => true,
     });
     let saturated = snapshots_with(&read, &[Saturated]);
-    let offsets = [DriftedMasks, NoDark, NegativeOffset, WrongDark, Level];
+    let offsets = [DriftedMasks, NoDark, NegativeOffset, WrongDark, Level, MaskValues, MissingMask];
     judged
         .retain(|finding| !(is_one_of(finding, &offsets) && saturated.contains(&finding.snapshot)));
     let (mut findings, others): (Vec<_>, Vec<_>) = judged
@@ -60,6 +70,11 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
     // If masks were sent as the measurement, their scale is an effect.
     findings.sort_by_key(|finding| !finding.is(BinaryMeasurement));
     findings
+}
+
+/// Orders findings by cause: altered values of the masks make a calibration look bad.
+pub fn causes_first(findings: &mut [Finding]) {
+    findings.sort_by_key(|finding| !finding.is(FindingCode::MaskValues));
 }
 
 /// Checks a few snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
@@ -82,16 +97,23 @@ pub fn judge(
         if let Some(dispersion) = dispersion {
             // Neighbouring bands resemble one another, so the right masks explain hardly more than displaced ones.
             figures.drift[usize::from(dispersion.axis == DispersionAxis::Column)].excess = 0.0;
+            (figures.distortion, figures.alteration) = (None, None);
         }
         let number = u32::try_from(snapshot).ok();
         let mut judged = judge_measurement(&figures, dark_subtracted);
+        let explained =
+            [FindingCode::InvertedMasks, FindingCode::ResampledMasks, FindingCode::ShiftedMasks];
+        // Masks at another place explain some of the light by chance, above all in small pictures.
         if mosaic.is_none()
             && !figures.is_flat
-            && judged.iter().any(|finding| finding.code == FindingCode::ForeignMasks)
+            && figures.explained_unshifted < MIN_EXPLAINED
+            && !judged.iter().any(|finding| explained.contains(&finding.code))
             && let Some(misplaced) = misplaced_masks((&masks, &snapshots), snapshot, &figures)?
+            && (dispersion.is_none() || Dispersion::admits(misplaced.code))
         {
-            judged.retain(|finding| finding.code != FindingCode::ForeignMasks);
-            judged.push(misplaced);
+            let places = [FindingCode::DriftedMasks, FindingCode::ForeignMasks];
+            judged.retain(|finding| !places.contains(&finding.code));
+            judged.insert(0, misplaced);
         }
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
@@ -178,10 +200,50 @@ fn misplaced_masks(
     snapshot: usize,
     given: &MeasurementFigures,
 ) -> Result<Option<optics::Finding>, FormatError> {
-    match displaced_masks(files, snapshot, given)? {
-        Some(displaced) => Ok(Some(displaced)),
-        None => turned_masks(files, snapshot, given),
+    // Each search finds something by chance in a small picture, so the one that explains most decides.
+    let mut best: Option<Misplaced> = None;
+    for search in [displaced_masks, turned_masks, magnified_masks] {
+        let found = search(files, snapshot, given)?;
+        if let Some(found) = found.filter(|found| found.is_better_than(given))
+            && best.as_ref().is_none_or(|best| found.explained > best.explained)
+        {
+            best = Some(found);
+        }
     }
+    Ok(best.map(|best| best.finding))
+}
+
+/// Masks that fit after a change.
+struct Misplaced {
+    /// Share of the fine structure that a fit of all frames explains then.
+    explained: f64,
+    finding: optics::Finding,
+}
+
+impl Misplaced {
+    fn is_better_than(&self, given: &MeasurementFigures) -> bool {
+        self.explained > MIN_EXPLAINED
+            && self.explained > MISPLACED_GAIN * given.explained_unshifted
+    }
+}
+
+/// Share of the fine structure of `y` \[H,W\] that `masks` \[B,H,W\] explain when they are moved by a displacement.
+fn explained_after(
+    masks: ArrayView3<'_, f32>,
+    y: ArrayView2<'_, f32>,
+    displacement: &Displacement,
+) -> f64 {
+    let cut = |length: usize, moved: i32| {
+        let by = (moved.unsigned_abs() as usize).min(length);
+        let (early, late) = (0..length - by, by..length);
+        if moved > 0 { (early, late) } else { (late, early) }
+    };
+    let (frames, height, width) = masks.dim();
+    let (mask_rows, y_rows) = cut(height, displacement.rows);
+    let (mask_columns, y_columns) = cut(width, displacement.columns);
+    let mut study = MeasurementStudy::new(frames);
+    study.add(masks.slice(s![.., mask_rows, mask_columns]), y.slice(s![y_rows, y_columns]), (0, 0));
+    study.finish().map_or(0.0, |figures| figures.explained)
 }
 
 /// Looks for a displacement by more pixels than a fit of the frames covers, as after a wrong crop.
@@ -189,7 +251,7 @@ fn displaced_masks(
     (masks, snapshots): (&Reader, &Reader),
     snapshot: usize,
     given: &MeasurementFigures,
-) -> Result<Option<optics::Finding>, FormatError> {
+) -> Result<Option<Misplaced>, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
     let reach = LARGEST_DISPLACEMENT.min(height.min(width) / 4);
     let side = WINDOW + 2 * reach;
@@ -197,21 +259,69 @@ fn displaced_masks(
     let (rows, columns) = (window(height), window(width));
     let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
     let band = masks.read_window(0..frames, rows, columns)?;
-    let light = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask }).sum_axis(Axis(0));
-    let found = displacement(light.view(), filled(y.index_axis(Axis(0), 0)).view(), reach);
-    let right = found.filter(|found| {
-        found.explained > MIN_EXPLAINED
-            && found.explained > MISPLACED_GAIN * given.explained_unshifted
-    });
-    Ok(right.map(|Displacement { rows, columns, explained }| {
+    let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+    let y = filled(y.index_axis(Axis(0), 0));
+    let found = displacement(band.sum_axis(Axis(0)).view(), y.view(), reach);
+    let found = found.filter(|found| found.explained > MIN_EXPLAINED);
+    Ok(found.map(|found| {
+        let explained = explained_after(band.view(), y.view(), &found);
         let detail = format!(
-            "the masks explain {:.0} % of the fine structure of the measurement when shifted by {rows} rows and \
-             {columns} columns, but only {:.1} % without a shift. The measurement is probably a crop that begins at \
-             another place than the masks",
+            "the masks explain {:.0} % of the fine structure of the measurement when shifted by {} rows and {} columns, \
+             but only {:.1} % without a shift. The measurement is probably a crop that begins at another place than the \
+             masks",
+            100.0 * explained,
+            found.rows,
+            found.columns,
+            100.0 * given.explained_unshifted
+        );
+        Misplaced { explained, finding: optics::Finding::new(FindingCode::ShiftedMasks, detail) }
+    }))
+}
+
+/// Side of the window in which other magnifications are searched, in pixels.
+const MAGNIFIED_WINDOW: usize = 256;
+
+/// Looks for a magnification of the masks that explains a snapshot, which the given one does not.
+fn magnified_masks(
+    (masks, snapshots): (&Reader, &Reader),
+    snapshot: usize,
+    given: &MeasurementFigures,
+) -> Result<Option<Misplaced>, FormatError> {
+    let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
+    let window = |length: usize| {
+        let side = length.min(MAGNIFIED_WINDOW);
+        (length - side) / 2..(length - side) / 2 + side
+    };
+    let (rows, columns) = (window(height), window(width));
+    let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
+    let y = filled(y.index_axis(Axis(0), 0));
+    let band = masks.read_window(0..frames, rows, columns)?;
+    let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+    let found = magnification(band.sum_axis(Axis(0)).view(), y.view());
+    let Some(Magnified { factor, displacement }) = found else { return Ok(None) };
+    // The search compares the sum of the masks; the fit of all frames decides.
+    let mut enlarged = Vec::new();
+    for mask in band.outer_iter() {
+        enlarged.extend(magnified(mask, factor));
+    }
+    let Some(size) = enlarged.first().map(Array2::dim) else { return Ok(None) };
+    let views: Vec<_> = enlarged.iter().map(|mask| mask.view()).collect();
+    let Ok(enlarged) = ndarray::stack(Axis(0), &views) else { return Ok(None) };
+    let y = central(y.view(), size);
+    let explained = explained_after(enlarged.view(), y, &displacement);
+    Ok(Some({
+        let change = match factor > 1.0 {
+            true => format!("enlarged by a factor of about {factor:.2}"),
+            false => format!("reduced by a factor of about {:.2}", factor.recip()),
+        };
+        let detail = format!(
+            "the masks explain {:.0} % of the fine structure of the measurement when {change}, but only {:.1} % in \
+             their size. Most likely masks or measurement were resized or binned after their recording: compare the sizes of \
+             the raw files. Otherwise the lens was changed since the calibration",
             100.0 * explained,
             100.0 * given.explained_unshifted
         );
-        optics::Finding::new(FindingCode::ShiftedMasks, detail)
+        Misplaced { explained, finding: optics::Finding::new(FindingCode::ResampledMasks, detail) }
     }))
 }
 
@@ -220,7 +330,7 @@ fn turned_masks(
     files: (&Reader, &Reader),
     snapshot: usize,
     given: &MeasurementFigures,
-) -> Result<Option<optics::Finding>, FormatError> {
+) -> Result<Option<Misplaced>, FormatError> {
     let (height, width) = (files.0.info().height, files.0.info().width);
     let mut best: Option<(f64, Turn)> = None;
     for turn in Turn::others(height, width) {
@@ -230,10 +340,7 @@ fn turned_masks(
             best = Some((explained, turn));
         }
     }
-    let right = best.filter(|(explained, _)| {
-        *explained > MIN_EXPLAINED && *explained > MISPLACED_GAIN * given.explained_unshifted
-    });
-    Ok(right.map(|(explained, turn)| {
+    Ok(best.map(|(explained, turn)| {
         let axes = if turn == (Turn { transposed: true, ..Turn::default() }) {
             ". The masks were probably read with a wrong order of axes: state `frame-column-row` as `axes` where \
              `frame-row-column` was taken, and the other way round"
@@ -247,7 +354,7 @@ fn turned_masks(
             turn.describe(),
             100.0 * given.explained_unshifted
         );
-        optics::Finding::new(FindingCode::TurnedMasks, detail)
+        Misplaced { explained, finding: optics::Finding::new(FindingCode::TurnedMasks, detail) }
     }))
 }
 
@@ -274,7 +381,8 @@ fn study(
             };
             let y = snapshots.read_lattice(snapshot..snapshot + 1, place, step)?;
             let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
-            study.add(band.view(), filled(y.index_axis(Axis(0), 0)).view());
+            let first = (rows.start, columns.start);
+            study.add(band.view(), filled(y.index_axis(Axis(0), 0)).view(), first);
         }
     }
     Ok(study)

@@ -13,13 +13,14 @@ mod read;
 mod refusal;
 mod report_page;
 mod sample;
+mod sizes;
 mod spectral;
 
 pub use bad_pixels::bad_pixels;
 pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
 pub use check::{Behind, Exposure, Passed, masks, measurement};
 pub use error::IntakeError;
-pub use judge::{combined, judge};
+pub use judge::{causes_first, combined, judge};
 pub use open::{Opened, Source};
 pub use read::{
     Scaled, Snapshots, read_clip, read_colours, read_masks, read_snapshots, read_truth,
@@ -27,4 +28,5 @@ pub use read::{
 pub use refusal::{Refusal, RefusalCode};
 pub use report_page::report_page;
 pub use sample::{Sample, sample};
+pub use sizes::size_remedy;
 pub use spectral::expected_size;

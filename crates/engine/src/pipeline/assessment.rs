@@ -191,8 +191,10 @@ pub fn expected(
     reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
     reasons.extend(unfamiliar.then(unfamiliar_masks_finding));
-    // An uneven error is an effect of the other causes.
-    reasons.sort_by_key(|reason| reason.is(FindingCode::UnevenError));
+    // An uneven error is an effect of the other causes. A bad calibration may be one of altered values of the masks.
+    reasons.sort_by_key(|reason| {
+        (reason.is(FindingCode::UnevenError), !reason.is(FindingCode::MaskValues))
+    });
     let stated = |decibels| (!is_in_doubt(&reasons)).then(|| Assessment::round(decibels));
     let assessment = Assessment {
         grade: grade((psnr_db, high), &reasons),
@@ -210,10 +212,11 @@ pub fn expected(
 fn is_in_doubt(findings: &[Finding]) -> bool {
     use FindingCode::{
         BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
-        InvertedMasks, MaskScale, MisplacedMasks, MissingPattern, Mosaic, Negative, NegativeOffset,
-        NoDark, ShiftedMasks, TurnedMasks, UnexplainedPixels, WrongDark,
+        InvertedMasks, MaskScale, MaskValues, MisplacedMasks, MissingMask, MissingPattern, Mosaic,
+        Negative, NegativeOffset, NoDark, ResampledMasks, ShiftedMasks, TurnedMasks,
+        UnexplainedPixels, WrongDark,
     };
-    const DOUBTS: [FindingCode; 17] = [
+    const DOUBTS: [FindingCode; 20] = [
         BadCalibration,
         BinaryMeasurement,
         DriftedMasks,
@@ -221,12 +224,15 @@ fn is_in_doubt(findings: &[Finding]) -> bool {
         ForeignMasks,
         InvertedMasks,
         MaskScale,
+        MaskValues,
         MisplacedMasks,
+        MissingMask,
         MissingPattern,
         Mosaic,
         Negative,
         NegativeOffset,
         NoDark,
+        ResampledMasks,
         ShiftedMasks,
         TurnedMasks,
         UnexplainedPixels,
@@ -264,7 +270,7 @@ fn exchanged_masks(orders: &[Order]) -> Option<Finding> {
     let (first, second) = pair.filter(|_| common_order(orders) == Some(MaskOrder::Doubtful))?;
     let detail = format!(
         "the frames would follow one another more steadily if frames {first} and {second} (counted from 0) were \
-         exchanged: the masks are probably in a wrong order"
+         exchanged: the masks are probably in a wrong order. A missing mask looks similar: count the masks first"
     );
     let finding = Finding::new(FindingCode::ExchangedMasks, detail);
     Some(Finding { frames: vec![first, second], ..finding })
