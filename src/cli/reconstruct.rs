@@ -26,10 +26,10 @@ use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Dispersion, Finding, Mosaic, Registered, RegistrationRequest,
-    SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
+    Algorithm, Assessment, Dispersion, Finding, Inputs, MaskInputs, MeasurementInputs, Mosaic,
+    Registered, RegistrationRequest, SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
 };
-use engine::pipeline::manifest::{Inputs, Manifest, Recipe, ScaleRecord, VERSION};
+use engine::pipeline::manifest::{Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
@@ -222,7 +222,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut histogram = Histogram::default();
     (0..frames * snapshots.len()).for_each(|index| histogram.add(&frame(index)));
     let white_level = white_level(&histogram, white);
-    let recipe = input.recipe(&setup, (white, white_level), &solved)?;
+    let recipe = input.recipe(&setup, (white, white_level), &solved, arguments)?;
     let expected = |snapshot| {
         let assessments = solved.assessments(&sequence, snapshot, &recipe.schedule);
         // The quality model is fitted to the embedded networks.
@@ -477,11 +477,41 @@ impl<'a> Input<'a> {
         if changes_white { self.white() } else { Ok(white) }
     }
 
+    /// The origin of masks and snapshots, as a job records it.
+    fn inputs(&self, arguments: &Arguments) -> Result<Inputs> {
+        let (masks, snapshots) = (&arguments.mask_file, &arguments.snapshot_file);
+        let bad_pixels = masks.bad_pixels.as_deref().map(sha256).transpose()?;
+        let dark = snapshots.dark.iter().map(|file| sha256(file));
+        Ok(Inputs {
+            masks: MaskInputs {
+                masks_sha256: sha256(self.sources.masks.path)?,
+                masks_axes: self.masks.axes.map(|axes| axes.to_string()),
+                masks_array: masks.masks_array.clone(),
+                masks_crop: masks.masks_crop,
+                masks_frames: masks.masks_frames,
+                masks_packing: masks.masks_packing,
+                bad_pixels_sha256: bad_pixels,
+                captures: None,
+                registration_of: None,
+            },
+            measurement: MeasurementInputs {
+                measurement_sha256: sha256(self.sources.measurement.path)?,
+                measurement_axes: self.measurement.axes.map(|axes| axes.to_string()),
+                measurement_array: snapshots.array.clone(),
+                measurement_crop: snapshots.crop,
+                measurement_packing: snapshots.packing,
+                dark_sha256: dark.collect::<Result<_>>()?,
+                saturation: snapshots.saturation,
+            },
+        })
+    }
+
     fn recipe(
         &self,
         setup: &Setup,
         (normalisation, white_level): (f32, f32),
         solved: &Solved,
+        arguments: &Arguments,
     ) -> Result<Recipe> {
         let pilot = solved.pilot.clone();
         let mut models = setup.network.records(&setup.schedule);
@@ -494,12 +524,7 @@ impl<'a> Input<'a> {
             registration: self.registration.clone(),
             shape: self.shape(),
             dispersion: self.sources.masks.dispersion.clone(),
-            inputs: Inputs {
-                masks_sha256: sha256(self.sources.masks.path)?,
-                masks_axes: self.masks.axes.map(|axes| axes.to_string()),
-                measurement_sha256: sha256(self.sources.measurement.path)?,
-                measurement_axes: self.measurement.axes.map(|axes| axes.to_string()),
-            },
+            inputs: self.inputs(arguments)?,
             models,
             scale: ScaleRecord {
                 masks_full_scale: self.masks.full_scale,

@@ -1,17 +1,22 @@
 //! `/v1/calibrations`: masks of optical setups.
 
+use axum::body::{Body, Bytes};
+use axum::http::{HeaderMap, Method};
 use axum::response::Response;
+use futures_util::stream::{self, StreamExt};
 use serde::{Deserialize, Serialize};
 
 use super::context::RequestContext;
+use super::download::{Download, stream_range};
 use super::error::{Problem, Result};
-use super::extract::{Caller, QueryOf};
+use super::extract::{Caller, Params, QueryOf};
 use super::page::{Cursor, Limit};
 use super::submissions::{Shown, Stage, page, pending};
 use engine::job::{
-    CalibrationId, CalibrationRequest, Dispersion, Label, Mosaic, Reading, Sha256, Submission,
-    Timestamp,
+    CalibrationId, CalibrationRequest, Dispersion, JobId, Label, Mosaic, Reading, Sha256,
+    Submission, Timestamp,
 };
+use formats::{Channels, npy, planar};
 use store::{Asked, Filter, Span};
 
 #[derive(Debug, Deserialize)]
@@ -44,7 +49,7 @@ pub(super) struct CalibrationBody {
 
 #[derive(Debug, Default, Serialize, schemars::JsonSchema)]
 struct CalibrationFacts {
-    /// The file of the masks.
+    /// SHA-256 of the uploaded file, or, if the service has made the masks, of the npy file at `masks` of the calibration.
     masks: Option<Sha256>,
     /// Format of the file.
     format: Option<String>,
@@ -69,12 +74,15 @@ struct CalibrationFacts {
     /// Displacement of the bands of a spectral camera; null for other cameras. Height and width are those of the measurement.
     dispersion: Option<Dispersion>,
     reading: Option<Reading>,
+    /// The map of bad pixels.
+    bad_pixels: Option<Sha256>,
+    /// The job whose registration has corrected the masks.
+    registration_of: Option<JobId>,
 }
 
 impl Shown for CalibrationId {
     const PATH: &'static str = "/v1/calibrations";
     const SUBMISSION: fn(CalibrationRequest) -> Submission = Submission::Calibration;
-    type Request = CalibrationRequest;
     type Body = CalibrationBody;
 
     fn body(asked: Asked<Self>) -> Result<CalibrationBody> {
@@ -105,6 +113,8 @@ impl Shown for CalibrationId {
                         mosaic: facts.mosaic,
                         dispersion: facts.dispersion,
                         reading: facts.reading,
+                        bad_pixels: calibration.request.bad_pixels,
+                        registration_of: calibration.request.registration_of,
                     },
                 });
             }
@@ -114,6 +124,8 @@ impl Shown for CalibrationId {
         if let Submission::Calibration(submission) = request.submission {
             facts.frames = submission.captures.map(|captures| captures.masks.len());
             (facts.mosaic, facts.dispersion) = (submission.mosaic, submission.dispersion);
+            facts.bad_pixels = submission.bad_pixels;
+            facts.registration_of = submission.registration_of;
         }
         Ok(CalibrationBody {
             id: request.id.into(),
@@ -136,4 +148,37 @@ pub(super) async fn list(
     let created = Span { from: query.created_after, before: query.created_before };
     let after = query.cursor.map(|Cursor(id)| id);
     page(caller, (query.limit, Filter { calibration: None, created, after }), &request).await
+}
+
+/// `GET /v1/calibrations/{calibration}/masks`: the masks on \[0,1\] as npy. Bad pixels are NaN.
+pub(super) async fn masks(
+    Caller(app, access): Caller,
+    Params(id): Params<CalibrationId>,
+    method: Method,
+    headers: HeaderMap,
+) -> Result<Response> {
+    let calibration = app.store.calibration(&access.lab, id).await?;
+    let (facts, prepared) = (calibration.facts, calibration.prepared);
+    let shape = (facts.frames, facts.height, facts.width);
+    let head = Bytes::from(npy::stack_header(shape, Channels::Grey));
+    let (frames, height, width) = shape;
+    let head_bytes = head.len() as u64;
+    let download = Download {
+        // The head follows from the shape, which the prepared file states too.
+        sha256: Sha256::of(format!("npy {prepared}").as_bytes()),
+        size: head_bytes + (frames * height * width * size_of::<f32>()) as u64,
+        kind: "application/octet-stream",
+        disposition: format!("attachment; filename=\"{id}-masks.npy\""),
+        accepts_ranges: true,
+    };
+    #[allow(clippy::cast_possible_truncation)] // within the head
+    let read = async |start: u64, length: u64| {
+        let file = app.store.open_blob(prepared).await?;
+        let (from, to) = (start.min(head_bytes), (start + length).min(head_bytes));
+        let head = head.slice(from as usize..to as usize);
+        let values = planar::HEADER_BYTES + start.saturating_sub(head_bytes);
+        let values = stream_range(file, values, length - (to - from)).await?;
+        Ok(Body::from_stream(stream::iter([Ok(head)]).chain(values)))
+    };
+    download.answer(read, (&method, &headers)).await
 }

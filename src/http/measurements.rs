@@ -55,7 +55,6 @@ struct MeasurementFacts {
 impl Shown for MeasurementId {
     const PATH: &'static str = "/v1/measurements";
     const SUBMISSION: fn(MeasurementRequest) -> Submission = Submission::Measurement;
-    type Request = MeasurementRequest;
     type Body = MeasurementBody;
 
     fn body(asked: Asked<Self>) -> Result<MeasurementBody> {

@@ -30,7 +30,6 @@ pub(super) struct ModelBody {
 impl Shown for ModelId {
     const PATH: &'static str = "/v1/models";
     const SUBMISSION: fn(ModelRequest) -> Submission = Submission::Model;
-    type Request = ModelRequest;
     type Body = ModelBody;
 
     /// Errors: 404 if the network has not passed its check.

@@ -53,6 +53,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
         R::at("/v1/calibrations").get(calibrations::list).post(submissions::create::<CalibrationId>).slow(),
         R::at("/v1/calibrations/{calibration}").get(submissions::show::<CalibrationId>).patch(submissions::rename::<CalibrationId>).delete(submissions::delete::<CalibrationId>),
+        R::at("/v1/calibrations/{calibration}/masks").get(calibrations::masks).slow(),
         R::at("/v1/calibrations/{calibration}/report").get(reports::json),
         R::at("/v1/measurements").get(submissions::list::<MeasurementId>).post(submissions::create::<MeasurementId>).slow(),
         R::at("/v1/measurements/{measurement}").get(submissions::show::<MeasurementId>).patch(submissions::rename::<MeasurementId>).delete(submissions::delete::<MeasurementId>),

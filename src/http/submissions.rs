@@ -41,7 +41,6 @@ pub(super) trait Shown: Resource + DeserializeOwned + 'static {
     /// The address of the list.
     const PATH: &'static str;
     const SUBMISSION: fn(Self::Request) -> Submission;
-    type Request: Serialize + DeserializeOwned + Send;
     type Body: Serialize + Send;
 
     fn body(asked: Asked<Self>) -> Result<Self::Body>;

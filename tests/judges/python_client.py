@@ -137,7 +137,16 @@ def main():
         )
         napari(result)
         jupyter(result)
-        assert result.download("stack.tif", snapshot=1).read_bytes()[:2] == b"II"
+        tiff = result.download("stack.tif", snapshot=1)
+        content = tiff.read_bytes()
+        assert content[:2] == b"II"
+        # Neither a file of another job nor an incomplete file is taken for the export.
+        tiff.write_bytes(bytes(len(content)))
+        etag = client.http.head(f"/v1/jobs/{result.job.id}/snapshots/1/exports/tiff").headers["ETag"].strip('"')
+        tiff.with_name(f".stack.tif.{etag[:16]}.part").write_bytes(bytes(1000))
+        again = sci_recon.Result(result.job, folder / "result")
+        assert again.download("stack.tif", snapshot=1) == tiff and tiff.read_bytes() == content
+        assert (client.calibration(result.job.record["calibration"]).masks() == masks).all()
         with warnings.catch_warnings(record=True) as issued:
             warnings.simplefilter("always")
             wrong = client.reconstruct(masks[:, ::-1], measurement, "gap-tv")

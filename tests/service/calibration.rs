@@ -8,6 +8,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
+use crate::faults::sha256;
 use crate::pipeline::values;
 use crate::samples::npy;
 
@@ -149,22 +150,12 @@ pub fn codes_and_frames(findings: &Value) -> Vec<(String, Vec<u64>)> {
     findings.as_array().unwrap().iter().map(finding).collect()
 }
 
-/// The prepared masks of a calibration, read from the store's folder.
-fn masks(app: &TestApp, calibration: &Value) -> Vec<f32> {
-    let sha256 = calibration["masks"].as_str().unwrap();
-    let file = find(&app.data().join("blobs"), sha256).expect("the masks are stored");
-    let bytes = std::fs::read(file).unwrap();
-    bytes[32..].chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
-}
-
-fn find(folder: &Path, name: &str) -> Option<std::path::PathBuf> {
-    std::fs::read_dir(folder).unwrap().find_map(|entry| {
-        let path = entry.unwrap().path();
-        if path.is_dir() {
-            return find(&path, name);
-        }
-        path.to_string_lossy().replace('/', "").ends_with(name).then_some(path)
-    })
+/// The masks of a calibration, which must have the recorded hash.
+async fn masks(app: &TestApp, calibration: &Value) -> Vec<f32> {
+    let path = format!("/v1/calibrations/{}/masks", calibration["id"].as_str().unwrap());
+    let file = app.get(&path).await.expect(200).bytes;
+    assert_eq!(calibration["masks"], sha256(&file));
+    values(&file)
 }
 
 #[tokio::test]
@@ -180,7 +171,7 @@ async fn captures_give_masks_within_their_statistical_error() {
         let scale = figures["mask_scale"].as_f64().unwrap();
         let truth = values(&lab.file("masks.npy"));
         let true_scale = lab.json("simulation.json")["mask_scale"].as_f64().unwrap();
-        let computed = masks(&app, &calibration);
+        let computed = masks(&app, &calibration).await;
         assert_eq!(computed.len(), truth.len());
         let errors = computed.iter().zip(&truth);
         let errors: Vec<f64> = errors

@@ -6,11 +6,13 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use reqwest::Method;
 use serde_json::{Value, json};
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::Command;
 
 use crate::app::TestApp;
+use crate::faults::sha256;
 use crate::resumable::cutting;
 use crate::samples::{Scene, constant};
 
@@ -138,6 +140,88 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     let jobs: Vec<&str> = listed.lines().filter(|line| !line.starts_with(' ')).collect();
     assert!(jobs.len() == 1 && jobs[0].contains(&job) && jobs[0].contains("first"), "{listed}");
     assert_eq!(lab.text(&["ls", "--state", "failed"]).await, "");
+}
+
+/// Forms of frames have the same size for all frames of a shape.
+#[tokio::test]
+async fn files_of_the_same_size_are_not_taken_for_one_another() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let lab = Lab::new(format!("http://{}", app.address()), "");
+    let scene = Scene { frames: 4, height: 128, width: 128, snapshots: 2 };
+    lab.write("masks.npy", &scene.masks());
+    lab.write("shots.npy", &scene.snapshots());
+    lab.write("cut.npy", &scene.with_a_cut(1));
+    let submit = async |file: &str| {
+        let line = ["submit", file, "--masks", "masks.npy", "--algorithm", "gap-tv"];
+        let job = String::from_utf8(lab.run(&line).await.stdout).unwrap().trim().to_owned();
+        assert_eq!(app.ended(&job).await["state"], "succeeded");
+        job
+    };
+    let (first, second) = (submit("shots.npy").await, submit("cut.npy").await);
+    for (name, file, export) in [
+        ("stack.tif", "snapshot_0001/stack.tif", "snapshots/1/exports/tiff"),
+        (
+            "stack-sigma.exr",
+            "snapshot_0001/stack-sigma.exr",
+            "snapshots/1/exports/exr?layers=sigma",
+        ),
+        ("sequence.npy", "sequence.npy", "exports/npy"),
+        ("sequence.tif", "sequence.tif", "exports/tiff"),
+        ("results.zip", "results.zip", "exports/zip"),
+        ("frames.npy", "snapshot_0001/frames.npy", "snapshots/1/exports/npy"),
+    ] {
+        let fetch =
+            async |job: &str| lab.run(&["fetch", job, "--out", "out", "--file", name]).await;
+        let served =
+            async |job: &str| app.get(&format!("/v1/jobs/{job}/{export}")).await.expect(200).bytes;
+        let refused = async |job: &str| {
+            let output = fetch(job).await;
+            let text = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert_eq!(output.status.code(), Some(2), "{name}: {text}");
+            assert!(text.contains("it is not overwritten"), "{name}: {text}");
+        };
+        let content = served(&first).await;
+        fetch(&first).await;
+        let path = lab.path("out").join(file);
+        assert!(std::fs::read(&path).unwrap() == content, "{name}");
+        refused(&second).await;
+        assert!(std::fs::read(&path).unwrap() == content, "{name}");
+        // An identical file is accepted, and a damaged one is refused.
+        let output = fetch(&first).await;
+        assert_ne!(output.status.code(), Some(2), "{name}");
+        let mut damaged = content.to_vec();
+        damaged[1000..1100].fill(0x55);
+        std::fs::write(&path, &damaged).unwrap();
+        refused(&first).await;
+        std::fs::remove_file(&path).unwrap();
+
+        // The beginning of an interrupted download counts only if its record confirms it.
+        let head = app.send(app.request(Method::HEAD, &format!("/v1/jobs/{first}/{export}"))).await;
+        let etag: String = head.header("etag").trim_matches('"').chars().take(16).collect();
+        let base = path.file_name().unwrap().to_str().unwrap();
+        let part = path.with_file_name(format!(".{base}.{etag}.part"));
+        let record = path.with_file_name(format!(".{base}.{etag}.part.sha256"));
+        let sound = format!("1000 {}\n", sha256(&content[..1000]));
+        let [zeros, longer] = [vec![0; 1000], [&content[..], b"xx"].concat()];
+        for (beginning, text) in [
+            (&content[..1000], Some(sound.clone())),
+            (&zeros[..], Some(sound.clone())),
+            (&zeros[..], None),
+            (&content[..500], Some(sound)),
+            (&longer[..], Some(format!("{} {}\n", longer.len(), sha256(&longer)))),
+            (&longer[..], Some("12".to_owned())),
+        ] {
+            std::fs::write(&part, beginning).unwrap();
+            if let Some(text) = text {
+                std::fs::write(&record, text).unwrap();
+            }
+            let output = fetch(&first).await;
+            let text = String::from_utf8_lossy(&output.stderr).into_owned();
+            assert!(std::fs::read(&path).unwrap() == content, "{name}: {text}");
+            assert!(!part.exists() && !record.exists(), "{name}");
+            std::fs::remove_file(&path).unwrap();
+        }
+    }
 }
 
 /// Partial files.

@@ -42,6 +42,7 @@ mod load;
 mod measurement_check;
 mod pictures;
 mod pipeline;
+mod provenance;
 mod recipes;
 mod registration;
 mod resumable;

@@ -1,8 +1,10 @@
 //! Registration of masks that have moved since their calibration.
 
+use reqwest::Method;
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
+use crate::faults::sha256;
 use crate::pipeline::{psnr, values};
 use crate::samples::{Scene, npy};
 
@@ -193,6 +195,17 @@ async fn corrected_masks_become_a_calibration() {
     ] {
         assert_eq!(saved[fact], expected, "{saved:#}");
     }
+    assert_eq!(saved["registration_of"], auto["id"]);
+    let path = format!("/v1/calibrations/{}", saved["id"].as_str().unwrap());
+    let report = app.get_until(&format!("{path}/report"), 200).await.json();
+    assert_eq!(report["registration_of"], auto["id"]);
+    // The recorded hash is that of the masks that a lab can download.
+    let npy = app.get(&format!("{path}/masks")).await.expect(200).bytes;
+    assert_eq!(saved["masks"], sha256(&npy));
+    let whole = values(&npy);
+    assert_eq!(whole.len(), frames * height * width);
+    let range = app.request(Method::GET, &format!("{path}/masks")).header("Range", "bytes=100-299");
+    assert_eq!(app.send(range).await.expect(206).bytes, npy[100..300]);
     // The saved masks fit the measurement, and serve it as well as the correction within the job.
     let saved = saved["id"].as_str().unwrap();
     let again = id(&app.measure(saved, snapshot(SCENE, SHIFTED)).await.expect(201));
@@ -200,6 +213,13 @@ async fn corrected_masks_become_a_calibration() {
     assert!(fits["registered"]["applied"] == false && !has_moved_masks(&fits), "{fits:#}");
     let quality = [&corrected, &frames].map(|file| psnr(SCENE, 0, &values(file)));
     assert!(quality[1] > quality[0] - 0.3, "{quality:?}");
+    let manifest = format!("/v1/jobs/{}/exports/manifest", fits["id"].as_str().unwrap());
+    let inputs = &app.get(&manifest).await.expect(200).json()["content"]["inputs"];
+    assert_eq!(inputs["masks_sha256"], sha256(&npy));
+    let origin = &inputs["registration_of"];
+    assert_eq!(origin["job"], auto["id"], "{inputs:#}");
+    assert_eq!(origin["shift"], auto["registered"]["shift"], "{inputs:#}");
+    assert_eq!(origin["masks_sha256"], sha256(&masks(SCENE)), "{inputs:#}");
 
     let (off, _) = run(&app, &moved, &json!("off")).await;
     let cancelled = app

@@ -15,7 +15,8 @@ use super::{Format, FormatError, Limits, SampleType, StackInfo};
 use crate::error::Result;
 
 const VERSION: u32 = 1;
-const HEADER_BYTES: u64 = 32;
+/// Length of the header in bytes.
+pub const HEADER_BYTES: u64 = 32;
 const SAMPLE_BYTES: u64 = 4;
 
 /// Writes the header of a prepared array, and returns a writer for its frames. `to` should be buffered. It is written

@@ -85,6 +85,7 @@ impl Lab {
             mosaic: None,
             reading: None,
             dispersion: None,
+            corrected: None,
         };
         let asked = CalibrationRequest { masks: Some(masks.sha256), ..Default::default() };
         let worker = WorkerId::new();

@@ -1,8 +1,9 @@
 //! Checks uploads: opens the files, validates and scales them, and writes those that pass as prepared arrays. All
 //! functions block.
 
-use std::io::ErrorKind;
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::{ErrorKind, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use ndarray::Array2;
@@ -15,13 +16,13 @@ use engine::intake::{
     size_remedy,
 };
 use engine::job::{
-    CalibrationRequest, Captures, MeasurementRequest, ModelRequest, Mosaic, Registered, Sequence,
-    Sha256, Submission, TaskStage, keeps_mosaic,
+    CalibrationRequest, Captures, CorrectedMasks, MeasurementRequest, ModelRequest, Mosaic,
+    Registered, Sequence, Sha256, Submission, TaskStage, keeps_mosaic,
 };
 use engine::pipeline::progress::Monitor;
 use engine::pipeline::registration;
 use formats::mat::SceneArray;
-use formats::{FormatError, Limits, Part, StackInfo, StackWriter, planar};
+use formats::{Channels, FormatError, Limits, Part, StackInfo, StackWriter, npy, planar};
 use store::{
     BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, NewModel, StoreError,
 };
@@ -220,6 +221,7 @@ impl Running<'_> {
             mosaic,
             reading: Some(reading),
             dispersion,
+            corrected: None,
         };
         Ok(Checked::Masks(facts, writer.finish()?.finish()?))
     }
@@ -228,7 +230,9 @@ impl Running<'_> {
     fn corrected(&self) -> Result<Checked> {
         let task = &self.check.task;
         let correction = task.registered.as_ref().and_then(Registered::correction);
-        let (Some(calibration), Some(correction)) = (&task.calibration, correction) else {
+        let job = task.request.submission.registration_of();
+        let (Some(calibration), Some(correction), Some(job)) = (&task.calibration, correction, job)
+        else {
             let detail = "the job has been deleted";
             let refusal = Refusal::new(RefusalCode::InvalidRequest, detail);
             return Err(refusal.at("/registration_of").into());
@@ -248,7 +252,7 @@ impl Running<'_> {
             })?;
         let masks = writer.finish()?.finish()?;
         let facts = NewCalibration {
-            masks: masks.sha256(),
+            masks: npy_sha256(masks.path(), &info)?,
             format: "registration".into(),
             sample: info.sample.to_string(),
             axes: None,
@@ -262,6 +266,12 @@ impl Running<'_> {
             mosaic: None,
             reading: None,
             dispersion: None,
+            corrected: Some(CorrectedMasks {
+                job,
+                correction,
+                masks_full_scale: calibration.facts.full_scale,
+                masks: calibration.inputs(),
+            }),
         };
         Ok(Checked::Masks(facts, masks))
     }
@@ -365,6 +375,17 @@ impl Running<'_> {
         let ModelRequest { calibration, file, .. } = *request;
         Ok(Checked::Model(NewModel { calibration, file, facts }))
     }
+}
+
+/// Hash of the npy file that the service sends for a prepared array.
+pub(super) fn npy_sha256(prepared: &Path, info: &StackInfo) -> Result<Sha256, FormatError> {
+    let hash = || {
+        let mut values = File::open(prepared)?;
+        values.seek(SeekFrom::Start(planar::HEADER_BYTES))?;
+        let head = npy::stack_header((info.frames, info.height, info.width), Channels::Grey);
+        Sha256::of_reader(&mut head.as_slice().chain(values))
+    };
+    Ok(hash().map_err(FormatError::io("hash the masks"))?.0)
 }
 
 /// Refuses a mosaic on pictures with an odd number of rows or columns.

@@ -13,11 +13,11 @@ use tokio::sync::Mutex;
 use super::transport::{
     Check, Claim, Done, LEASE, Output, TaskError, TaskInput, TileTask, Transport, TransportError,
 };
-use engine::job::{ModelRecord, Registered, Sha256, TaskKind, TaskProgress, WorkerId};
+use engine::job::{Inputs, ModelRecord, Registered, Sha256, TaskKind, TaskProgress, WorkerId};
 use engine::pipeline::PipelineError;
 use engine::pipeline::arrays::Arrays;
 use engine::pipeline::blend::StoredTile;
-use engine::pipeline::manifest::{CameraRecord, Inputs, JobTasks, Recipe, ScaleRecord, VERSION};
+use engine::pipeline::manifest::{CameraRecord, JobTasks, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::movie::{DisplayWindow, MovieTask};
 use engine::pipeline::networks::ModelFile;
 use engine::pipeline::pilot::full_schedule;
@@ -392,12 +392,7 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
         registration: registered(task.prepared.as_ref())?,
         shape: spec.shape,
         dispersion: spec.dispersion.clone(),
-        inputs: Inputs {
-            masks_sha256: calibration.masks,
-            masks_axes: calibration.axes.clone(),
-            measurement_sha256: measurement.data,
-            measurement_axes: measurement.axes.clone(),
-        },
+        inputs: Inputs { masks: task.calibration.inputs(), measurement: task.measurement.inputs() },
         models: ModelRecord::for_job(spec),
         scale: ScaleRecord {
             masks_full_scale: calibration.full_scale,

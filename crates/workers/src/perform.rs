@@ -6,7 +6,7 @@ use ndarray::Array3;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::check::check;
+use super::check::{check, npy_sha256};
 use super::model_process::ModelProcesses;
 use super::transport::{Done, Output, TaskError, TaskInput, TileTask, Transport, TransportError};
 use engine::intake::{self, Calibrated, IntakeError, Report, calibrate};
@@ -141,7 +141,9 @@ pub(super) fn perform(
                     proceed(share, monitor)
                 })?;
             let masks = masks.finish().map_err(TransportError::from)?;
-            let facts = facts(&calibrated, masks.sha256());
+            let stored = Reader::open(masks.path(), &limits).map_err(IntakeError::from)?;
+            let hash = npy_sha256(masks.path(), stored.info()).map_err(IntakeError::from)?;
+            let facts = facts(&calibrated, hash);
             (Value::Null, calibration(Some((facts, masks)), calibrated.report, monitor))
         }
         TaskInput::Movie(task, file) => {
@@ -190,6 +192,7 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
         mosaic: None,
         reading: None,
         dispersion: None,
+        corrected: None,
     }
 }
 

@@ -1,7 +1,7 @@
 //! Downloads a file, and resumes after an interruption. Existing files are not overwritten.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -9,6 +9,7 @@ use futures_util::StreamExt;
 use indicatif::ProgressBar;
 use reqwest::{Method, StatusCode};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
+use sha2::Digest;
 
 use super::{Client, Result, refusal, wait_to_retry};
 use crate::cli::CliError;
@@ -27,7 +28,8 @@ pub(in crate::cli) enum Fetched {
 }
 
 impl Client {
-    /// Downloads `href` to the file `path`, and checks its hash if one is given.
+    /// Downloads `href` to the file `path`, and checks its hash if one is given. An existing file without a known hash is
+    /// compared with a new download.
     /// Errors: another file has that name; the service can't be reached or refuses the request.
     pub(in crate::cli) async fn download(
         &self,
@@ -51,41 +53,55 @@ impl Client {
             );
         };
         bar.set_length(size);
-        if path.symlink_metadata().is_ok() {
-            return is_same(path, size, sha256).map_err(Into::into);
+        let exists = path.symlink_metadata().is_ok();
+        if exists {
+            let is_same = has_size(path, size)? && sha256.is_none_or(|sha256| has(path, sha256));
+            match (is_same, sha256) {
+                (false, _) => return Err(name_in_use(path).into()),
+                (true, Some(_)) => return Ok(Fetched::Existing),
+                // Files of one size may differ. Only the bytes of the service decide.
+                (true, None) => {}
+            }
         }
         // Another process may have downloaded the beginning. The ETag in the name identifies the file's content.
-        let part = part(path, &etag);
-        self.bytes(href, &etag, (&part, size), bar).await?;
-        settle(&part, path, sha256).map_err(Into::into)
+        let part = self.bytes(href, &etag, (part(path, &etag), size), bar).await?;
+        if let Some(expected) = sha256.filter(|expected| *expected != part.sha256()) {
+            let text = format!(
+                "{}: the downloaded file has the hash {}, not {expected}",
+                path.display(),
+                part.sha256()
+            );
+            // A damaged download can't be resumed.
+            part.remove();
+            return Err(CliError::Failure(text).into());
+        }
+        if exists {
+            let is_same = has(path, part.sha256());
+            part.remove();
+            return if is_same { Ok(Fetched::Existing) } else { Err(name_in_use(path).into()) };
+        }
+        part.publish(path)?;
+        Ok(Fetched::New)
     }
 
-    /// Downloads the bytes that `part` lacks.
+    /// Downloads the bytes that the file at `path` lacks.
     async fn bytes(
         &self,
         href: &str,
         etag: &str,
-        (part, size): (&Path, u64),
+        (path, size): (PathBuf, u64),
         bar: &ProgressBar,
-    ) -> Result<()> {
-        let unwritable = |error: std::io::Error| CliError::file("write", part, &error);
-        let folder = part.parent().unwrap_or(Path::new("."));
-        fs::create_dir_all(folder).map_err(unwritable)?;
-        let file = OpenOptions::new().create(true).append(true).open(part).map_err(unwritable)?;
-        // Two processes would append to the same file.
-        let mut file =
-            LockedFile::take(file).map_err(|error| CliError::file("lock", part, &error))?;
+    ) -> Result<Part> {
+        let mut part = Part::open(path, size)?;
         let mut attempt = 0;
         loop {
-            let received = file.metadata().map_err(unwritable)?.len();
-            bar.set_position(received);
-            if received == size {
-                file.sync_all().map_err(unwritable)?;
-                return Ok(());
+            bar.set_position(part.length);
+            if part.length == size {
+                return Ok(part);
             }
             let mut request = self.request(Method::GET, href);
-            if received > 0 {
-                let range = format!("bytes={received}-");
+            if part.length > 0 {
+                let range = format!("bytes={}-", part.length);
                 request = request.header("Range", range).header("If-Range", etag);
             }
             let answer = match request.send().await {
@@ -105,24 +121,133 @@ impl Client {
                 return Err(CliError::Failure(text).into());
             }
             if answer.status() != StatusCode::PARTIAL_CONTENT {
-                file.set_len(0).map_err(unwritable)?;
+                part.clear()?;
                 bar.set_position(0);
             }
             let mut bytes = answer.bytes_stream();
             while let Some(piece) = bytes.next().await {
                 match piece {
                     Ok(piece) => {
-                        file.write_all(&piece).map_err(unwritable)?;
+                        part.append(&piece)?;
                         bar.inc(piece.len() as u64);
                         attempt = 0;
                     }
                     Err(error) => {
+                        part.record()?;
                         wait_to_retry(self.interruption(&error), &mut attempt).await?;
                         break;
                     }
                 }
             }
         }
+    }
+}
+
+/// Bytes between two records of an incomplete file.
+const RECORD_BYTES: u64 = 1 << 20;
+
+/// An incomplete file. A second file records the length and the hash of its beginning, because a power failure can leave
+/// other bytes than were received.
+struct Part {
+    file: LockedFile,
+    path: PathBuf,
+    hasher: sha2::Sha256,
+    /// Number of bytes in the file.
+    length: u64,
+    /// Number of bytes in the record.
+    recorded: u64,
+}
+
+impl Part {
+    /// Opens the file, and keeps of an earlier one the beginning that agrees with its record.
+    fn open(path: PathBuf, size: u64) -> Result<Self, CliError> {
+        let unwritable = |error: std::io::Error| CliError::file("write", &path, &error);
+        let folder = path.parent().unwrap_or(Path::new("."));
+        fs::create_dir_all(folder).map_err(unwritable)?;
+        let mut options = OpenOptions::new();
+        let file = options.create(true).truncate(false).read(true).write(true).open(&path);
+        // Two processes would append to the same file.
+        let file = LockedFile::take(file.map_err(unwritable)?)
+            .map_err(|error| CliError::file("lock", &path, &error))?;
+        let mut part = Self { file, path, hasher: sha2::Sha256::new(), length: 0, recorded: 0 };
+        match part.resume(size) {
+            Ok(true) => Ok(part),
+            Ok(false) => part.clear().map(|()| part),
+            Err(error) => Err(part.unwritable(&error)),
+        }
+    }
+
+    /// Continues an earlier file. False if its beginning does not agree with its record.
+    fn resume(&mut self, size: u64) -> std::io::Result<bool> {
+        let Ok(text) = fs::read_to_string(self.record_path()) else { return Ok(false) };
+        let Some((length, sha256)) = text.trim_end().split_once(' ') else { return Ok(false) };
+        let (Ok(length), Ok(sha256)) = (length.parse::<u64>(), sha256.parse::<Sha256>()) else {
+            return Ok(false);
+        };
+        if length > size || length > self.file.metadata()?.len() {
+            return Ok(false);
+        }
+        let mut beginning = (&mut *self.file).take(length);
+        let mut buffer = vec![0; 256 * 1024];
+        loop {
+            match beginning.read(&mut buffer)? {
+                0 => break,
+                count => self.hasher.update(&buffer[..count]),
+            }
+        }
+        if self.sha256() != sha256 {
+            return Ok(false);
+        }
+        (self.length, self.recorded) = (length, length);
+        self.file.set_len(length)?;
+        Ok(true)
+    }
+
+    fn clear(&mut self) -> Result<(), CliError> {
+        (self.hasher, self.length, self.recorded) = (sha2::Sha256::new(), 0, 0);
+        let cleared = self.file.set_len(0).and_then(|()| self.file.rewind());
+        cleared.map_err(|error| self.unwritable(&error))
+    }
+
+    fn append(&mut self, piece: &[u8]) -> Result<(), CliError> {
+        self.file.write_all(piece).map_err(|error| self.unwritable(&error))?;
+        self.hasher.update(piece);
+        self.length += piece.len() as u64;
+        if self.length >= self.recorded + RECORD_BYTES { self.record() } else { Ok(()) }
+    }
+
+    /// Hash of the bytes in the file.
+    fn sha256(&self) -> Sha256 {
+        Sha256::new(self.hasher.clone().finalize().into())
+    }
+
+    /// Writes the record. A torn record agrees with no file, so the download starts again.
+    fn record(&mut self) -> Result<(), CliError> {
+        self.recorded = self.length;
+        let path = self.record_path();
+        let written = fs::write(&path, format!("{} {}\n", self.length, self.sha256()));
+        written.map_err(|error| CliError::file("write", &path, &error))
+    }
+
+    fn record_path(&self) -> PathBuf {
+        self.path.with_added_extension("sha256")
+    }
+
+    /// Gives a complete file the final name.
+    fn publish(self, path: &Path) -> Result<(), CliError> {
+        self.file.sync_all().map_err(|error| self.unwritable(&error))?;
+        rename_new(&self.path, path)?;
+        let _ = fs::remove_file(self.record_path());
+        Ok(())
+    }
+
+    fn remove(self) {
+        let _ = fs::remove_file(self.record_path());
+        let _ = fs::remove_file(&self.path);
+    }
+
+    fn unwritable(&self, error: &std::io::Error) -> CliError {
+        CliError::file("write", &self.path, error)
     }
 }
 
@@ -133,14 +258,16 @@ fn part(path: &Path, etag: &str) -> PathBuf {
     path.with_file_name(format!(".{name}.{tag}.part"))
 }
 
-/// Compares an existing file with the one that would be downloaded.
-/// Errors: it is a different file.
-fn is_same(path: &Path, size: u64, sha256: Option<Sha256>) -> Result<Fetched, CliError> {
+/// True for a regular file of this size.
+fn has_size(path: &Path, size: u64) -> Result<bool, CliError> {
     let meta = path.symlink_metadata().map_err(|error| CliError::file("read", path, &error))?;
-    let is_same = meta.is_file()
-        && meta.len() == size
-        && sha256.is_none_or(|sha256| hash(path).is_ok_and(|actual| actual == sha256));
-    if is_same { Ok(Fetched::Existing) } else { Err(name_in_use(path)) }
+    Ok(meta.is_file() && meta.len() == size)
+}
+
+/// True if the file can be read and has this hash.
+fn has(path: &Path, sha256: Sha256) -> bool {
+    let hash = || Ok::<_, std::io::Error>(Sha256::of_reader(&mut File::open(path)?)?.0);
+    hash().is_ok_and(|actual| actual == sha256)
 }
 
 fn name_in_use(path: &Path) -> CliError {
@@ -148,28 +275,6 @@ fn name_in_use(path: &Path) -> CliError {
         "{} exists and is a different file; it is not overwritten: choose another folder with --out",
         path.display()
     ))
-}
-
-fn hash(path: &Path) -> std::io::Result<Sha256> {
-    Ok(Sha256::of_reader(&mut File::open(path)?)?.0)
-}
-
-/// Checks a complete file, and gives it the final name.
-fn settle(part: &Path, path: &Path, sha256: Option<Sha256>) -> Result<Fetched, CliError> {
-    if let Some(expected) = sha256 {
-        let actual = hash(part).map_err(|error| CliError::file("read", part, &error))?;
-        if actual != expected {
-            // A damaged download can't be resumed.
-            let _ = fs::remove_file(part);
-            let text = format!(
-                "{}: the downloaded file has the hash {actual}, not {expected}",
-                path.display()
-            );
-            return Err(CliError::Failure(text));
-        }
-    }
-    rename_new(part, path)?;
-    Ok(Fetched::New)
 }
 
 /// Renames a file unless the new name is in use.

@@ -121,6 +121,8 @@ function about(item) {
     ["Full scale", exact(item.full_scale)],
     ["File", `${item.sample} in ${item.format}`],
     ["SHA-256 of the file", h("code", null, item.masks)],
+    item.bad_pixels && ["SHA-256 of the map of bad pixels", h("code", null, item.bad_pixels)],
+    item.registration_of && ["Corrected by the job", h("a", { href: `#/jobs/${item.registration_of}` }, item.registration_of)],
     ["Identifier", h("code", null, item.id)],
     ["Created", momentInFull(item.created_at)],
   ]));

@@ -476,24 +476,15 @@ class Calibration(Entity):
         return self
 
     def masks(self) -> npt.NDArray[np.float32]:
-        """The masks [B, H, W] on [0, 1], from the uploaded file. Raises `ValueError` if that is not an npy file.
+        """The masks [B, H, W] on [0, 1], as jobs use them. Bad pixels are NaN.
 
         A spectral camera has one mask for each band, as it lies on the sensor.
         """
-        record, name = self.record, self.record["masks"]
         with TemporaryDirectory(prefix="sci-recon-") as folder:
             path = Path(folder) / "masks.npy"
             with self.client._bar("download masks") as bar:
-                transfer.download(self.client.http, f"/v1/blobs/{name}/content", path, name, bar)
-            with path.open("rb") as file:
-                if file.read(6) != b"\x93NUMPY":
-                    raise ValueError(f"the masks are a {record['format']} file; read it, and pass the array")
-            stored = np.load(path)
-        if record["dispersion"]:
-            stored = sheared(stored, record["dispersion"], (record["height"], record["width"]))
-        order = (record["axes"] or "frame-row-column").split("-")
-        stored = stored.transpose([order.index(axis) for axis in ("frame", "row", "column")])
-        masks: npt.NDArray[np.float32] = np.maximum(stored / np.float64(record["full_scale"]), 0).astype(np.float32)
+                transfer.download(self.client.http, f"/v1/calibrations/{self.id}/masks", path, progress=bar)
+            masks: npt.NDArray[np.float32] = np.load(path)
         return masks
 
     def report(self) -> Record:
@@ -621,6 +612,8 @@ class Result:
         temporary = TemporaryDirectory(prefix="sci-recon-", ignore_cleanup_errors=True) if folder is None else None
         self._temporary = temporary
         self.folder = Path(temporary.name if temporary else folder or "")
+        # Exports that this object has downloaded.
+        self._exported: set[Path] = set()
 
     def __repr__(self) -> str:
         shape = self.job.record["shape"]
@@ -713,12 +706,12 @@ class Result:
         return path
 
     def _export(self, href: str, path: Path) -> Path:
-        """Downloads a file that the service composes of stored ones. Its ETag identifies the content."""
-        if not path.is_file():
-            http, href = self.job.client.http, f"/v1/jobs/{self.job.id}/{href}"
-            etag = transfer.send(http, "HEAD", href).headers["ETag"].strip('"')
+        """Downloads a file that the service composes of stored ones. Its bytes have no recorded hash, so that an existing
+        file can't be compared."""
+        if not (path in self._exported and path.is_file()):
             with self.job.client._bar(f"download {path.name}") as bar:
-                transfer.download(http, href, path, etag, bar, composed=True)
+                transfer.download(self.job.client.http, f"/v1/jobs/{self.job.id}/{href}", path, progress=bar)
+            self._exported.add(path)
         return path
 
     @property
@@ -751,19 +744,6 @@ def hashes(value: Any, role: str) -> Iterator[tuple[str, str]]:
     elif isinstance(value, list):
         for part in value:
             yield from hashes(part, role)
-
-
-def sheared(mask: npt.NDArray[Any], dispersion: Record, size: tuple[int, int]) -> npt.NDArray[np.float64]:
-    """The masks [B, H, W] of the bands on a sensor of this size, from one mask [H, W]."""
-    axis = 1 if dispersion["axis"] == "column" else 0
-    masks = np.zeros((len(dispersion["offsets"]), *size))
-    for band, offset in zip(np.moveaxis(masks, axis + 1, -1), dispersion["offsets"], strict=True):
-        along = np.moveaxis(np.asarray(mask, np.float64).reshape(mask.shape[-2], mask.shape[-1]), axis, -1)
-        whole, fraction = int(offset), offset - int(offset)
-        for start, weight in ((whole, 1 - fraction), (whole + 1, fraction)):
-            count = max(0, min(along.shape[-1], band.shape[-1] - start))
-            band[:, start : start + count] += weight * along[:, :count]
-    return masks
 
 
 def describe_all(findings: Sequence[Record]) -> list[str]:

@@ -171,22 +171,24 @@ def download(
     http: httpx.Client,
     href: str,
     path: Path,
-    expected: str,
+    expected: str | None = None,
     progress: Progress | None = None,
-    *,
-    composed: bool = False,
 ) -> None:
-    """Downloads a file, resumes after a lost connection, and checks its SHA-256. `expected` is its ETag; it is not the hash
-    of a `composed` file."""
+    """Downloads a file, resumes after a lost connection, and checks its SHA-256 `expected`. None stands for a file that
+    the service composes, for which no hash is recorded."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The name includes the hash, so that another process can resume the download of the same content.
-    part = path.with_name(f".{path.name}.{expected[:16]}.part")
+    etag = expected or send(http, "HEAD", href).headers["ETag"].strip('"')
+    # The name identifies the content, so that another process can resume its download.
+    part = path.with_name(f".{path.name}.{etag[:16]}.part")
+    if expected is None:
+        # Without a hash nothing could verify the bytes of another process.
+        part.unlink(missing_ok=True)
     attempt = 0
     while True:
         received = part.stat().st_size if part.exists() else 0
         headers = {"Accept-Encoding": "identity"}
         if received:
-            headers |= {"Range": f"bytes={received}-", "If-Range": f'"{expected}"'}
+            headers |= {"Range": f"bytes={received}-", "If-Range": f'"{etag}"'}
         try:
             with http.stream("GET", href, headers=headers) as response:
                 if response.status_code == 416:  # The file was complete already.
@@ -211,8 +213,7 @@ def download(
             if attempt == TRIES:
                 raise SciReconError(f"GET {href}: {error}") from error
             pause(attempt)
-    actual = expected if composed else sha256(part)
-    if actual != expected:
+    if expected is not None and (actual := sha256(part)) != expected:
         part.unlink()
         raise SciReconError(f"{href}: the downloaded file has the SHA-256 {actual}, not {expected}; download it again")
     part.replace(path)

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
 if TYPE_CHECKING:
     from ._client import Calibration
 
@@ -35,8 +37,8 @@ class Sensing:
 
     @classmethod
     def of(cls, calibration: Calibration) -> Sensing:
-        """The operator of a calibration of the service, as a numpy array of float32."""
-        return Sensing(calibration.masks())
+        """The operator of a calibration of the service, as a numpy array of float32. All masks are 0 at bad pixels."""
+        return Sensing(np.nan_to_num(calibration.masks()))
 
     @property
     def gram(self) -> Array:

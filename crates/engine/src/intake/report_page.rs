@@ -24,6 +24,9 @@ pub fn report_page(title: &str, report: &CalibrationReport) -> String {
             body {
                 main {
                     h1 { "Calibration " (title) }
+                    @if let Some(job) = &report.registration_of {
+                        p { "The registration of job " code { (job) } " has corrected these masks." }
+                    }
                     (grade(report))
                     h2 { "Masks" }
                     (masks(&report.masks, report))

@@ -5,6 +5,7 @@ mod algorithm;
 mod assessment;
 mod captures;
 mod ids;
+mod inputs;
 mod memory;
 mod model;
 mod pool;
@@ -28,6 +29,7 @@ pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,
     WorkerId,
 };
+pub use inputs::{CorrectedMasks, Inputs, MaskInputs, MeasurementInputs};
 pub use model::{JobModel, ModelFacts, ModelRecord, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::Pool;

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
 
+use super::ids::JobId;
 use optics::{CaptureFigures, MaskFigures};
 pub use optics::{FindingCode, Severity};
 
@@ -81,6 +82,9 @@ pub struct CalibrationReport {
     pub schema: String,
     pub grade: Grade,
     pub findings: Vec<Finding>,
+    /// The job whose registration has corrected the masks.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub registration_of: Option<JobId>,
     pub frames: usize,
     pub height: usize,
     pub width: usize,
@@ -161,6 +165,7 @@ impl CalibrationReport {
             schema: SCHEMA.into(),
             grade: Grade::of(&findings),
             findings,
+            registration_of: None,
             frames: masks.frame_means.len(),
             height,
             width,

@@ -180,6 +180,19 @@ impl Submission {
         }
     }
 
+    /// The uploads that stay in use once the request is fulfilled. Captures do not: they may have many times the bytes of
+    /// their masks.
+    pub fn kept_uploads(&self) -> Vec<Sha256> {
+        match self {
+            Self::Calibration(CalibrationRequest { masks, bad_pixels, .. }) => {
+                masks.iter().chain(bad_pixels).copied().collect()
+            }
+            Self::Measurement(_) | Self::Model(_) => {
+                self.uploads().into_iter().map(|(_, upload)| upload).collect()
+            }
+        }
+    }
+
     /// Planned CPU-seconds of a check that reads `bytes`.
     #[allow(clippy::cast_precision_loss)] // a plan
     pub fn check_cost(&self, bytes: u64) -> f64 {

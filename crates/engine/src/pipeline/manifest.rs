@@ -11,7 +11,7 @@ use serde::{Serialize, Serializer};
 use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, TileRecord};
 use crate::job::{
-    Algorithm, Assessment, CalibrationId, Dispersion, Finding, JobId, JobSpec, Label,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, Inputs, JobId, JobSpec, Label,
     MeasurementId, ModelId, ModelRecord, Mosaic, Registered, Repetition, ResultFile, SceneShape,
     Schedule, Sha256, TaskKind,
 };
@@ -244,17 +244,6 @@ pub struct Content {
     pub files: Vec<ResultFile>,
 }
 
-/// The inputs of a job.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Inputs {
-    pub masks_sha256: Sha256,
-    /// Order of the axes in which the masks were read; null for pictures.
-    pub masks_axes: Option<String>,
-    pub measurement_sha256: Sha256,
-    /// Order of the axes in which the measurement was read; null for pictures.
-    pub measurement_axes: Option<String>,
-}
-
 /// All factors between stored values and the unit scale of the solver. Frames are on the scale of the measurement
 /// divided by its full scale: the normalisation is undone. The full scale of the masks defines a mask value of 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -365,8 +354,8 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
         ("program".to_owned(), format!("sci-recon {}", recipe.program_version)),
         ("algorithm".to_owned(), recipe.algorithm.into_str().to_owned()),
         ("snapshot".to_owned(), content.snapshot.to_string()),
-        ("masksSha256".to_owned(), recipe.inputs.masks_sha256.to_string()),
-        ("measurementSha256".to_owned(), recipe.inputs.measurement_sha256.to_string()),
+        ("masksSha256".to_owned(), recipe.inputs.masks.masks_sha256.to_string()),
+        ("measurementSha256".to_owned(), recipe.inputs.measurement.measurement_sha256.to_string()),
         ("whiteLevel".to_owned(), recipe.scale.white_level.to_string()),
     ];
     if let Some(mosaic) = recipe.shape.mosaic {
@@ -395,6 +384,8 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
 }
 
 #[cfg(test)]
+use crate::job::{CalibrationRequest, MeasurementRequest};
+#[cfg(test)]
 use reconstruction::priors::onnx::Device;
 
 #[cfg(test)]
@@ -409,10 +400,9 @@ pub(super) fn sample(frames: usize) -> Manifest {
         registration: None,
         shape: SceneShape { frames, height: 20, width: 24, snapshots: 2, mosaic: None },
         inputs: Inputs {
-            masks_sha256: hash,
-            masks_axes: None,
-            measurement_sha256: hash,
-            measurement_axes: Some("frame-row-column".to_owned()),
+            masks: CalibrationRequest::default().inputs(hash, None, None),
+            measurement: MeasurementRequest::new(None, CalibrationId::new(), hash)
+                .inputs(Some("frame-row-column".to_owned())),
         },
         models: source.records(&Algorithm::PnpTvFastdvdnet.default_schedule()),
         scale: ScaleRecord {

@@ -165,21 +165,18 @@ impl Store {
                 let prepared = staged.sha256();
                 let seconds = planned_seconds(0, facts.frames, facts.height * facts.width);
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                let files = (prepared, facts.masks);
-                things::record::<CalibrationId>(transaction, id.into(), files, &facts).await?;
+                things::record::<CalibrationId>(transaction, id.into(), prepared, &facts).await?;
                 seconds
             }
             Checked::Captures(seconds) => seconds,
             Checked::Measurement(facts, staged) => {
                 let prepared = staged.sha256();
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                let files = (prepared, facts.data);
-                return things::record::<MeasurementId>(transaction, id.into(), files, &facts)
+                return things::record::<MeasurementId>(transaction, id.into(), prepared, &facts)
                     .await;
             }
             Checked::Model(facts) => {
-                let files = (facts.file, facts.file);
-                return things::record::<ModelId>(transaction, id.into(), files, &facts).await;
+                return things::record::<ModelId>(transaction, id.into(), facts.file, &facts).await;
             }
             Checked::Refused(refusal) => return requests::refuse(transaction, id, &refusal).await,
         };
@@ -217,19 +214,22 @@ impl Store {
         id: CalibrationId,
         done: CalibrationDone,
     ) -> Result<()> {
-        if let Some((facts, staged)) = done.masks {
+        let Submission::Calibration(request) =
+            requests::find(transaction, id.into()).await?.submission
+        else {
+            return Err(StoreError::missing("calibration", id));
+        };
+        let CalibrationDone { masks, report, maps } = done;
+        if let Some((facts, staged)) = masks {
             let prepared = staged.sha256();
             self.publish(transaction, staged, Origin::Prepared).await?;
-            let Submission::Calibration(request) =
-                requests::find(transaction, id.into()).await?.submission
-            else {
-                return Err(StoreError::missing("calibration", id));
-            };
             // The worker that makes masks knows nothing of colours.
             let facts = NewCalibration { mosaic: request.mosaic, ..facts };
-            things::record(transaction, id, (prepared, facts.masks), &facts).await?;
+            things::record(transaction, id, prepared, &facts).await?;
         }
-        if let Some(warning) = done.report.warning() {
+        // The worker that makes the report reads the masks alone.
+        let report = CalibrationReport { registration_of: request.registration_of, ..report };
+        if let Some(warning) = report.warning() {
             // A bad calibration causes other findings, so it comes first.
             sql!(
                 "UPDATE jobs SET spec = json_set(spec, '$.warnings', (
@@ -242,7 +242,7 @@ impl Store {
             .execute(&mut *transaction)
             .await?;
         }
-        reports::insert(transaction, id, &done.report, done.maps).await
+        reports::insert(transaction, id, &report, maps).await
     }
 }
 

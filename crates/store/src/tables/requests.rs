@@ -184,14 +184,11 @@ pub async fn promise(connection: &mut SqliteConnection, id: ThingId, bytes: u64)
 }
 
 /// Ends what a request held for being fulfilled: its promise, and its uploads except `kept`.
-pub async fn fulfil(
-    connection: &mut SqliteConnection,
-    id: ThingId,
-    kept: Option<Sha256>,
-) -> Result<()> {
+pub async fn fulfil(connection: &mut SqliteConnection, id: ThingId, kept: &[Sha256]) -> Result<()> {
     promise(connection, id, 0).await?;
-    let unused = "DELETE FROM request_files WHERE id = ? AND sha256 IS NOT ?";
-    sql!(unused, [id, kept]).execute(connection).await?;
+    let unused = "DELETE FROM request_files
+                  WHERE id = ? AND sha256 NOT IN (SELECT value FROM json_each(?))";
+    sql!(unused, [id, Json(kept)]).execute(connection).await?;
     Ok(())
 }
 
@@ -206,7 +203,7 @@ pub async fn refuse(
         sql!("UPDATE requests SET refusal = ? WHERE id = ? AND facts IS NULL", [Json(refusal), id]);
     if refused.execute(&mut *connection).await?.rows_affected() > 0 {
         sql!("DELETE FROM request_keys WHERE id = ?", [id]).execute(&mut *connection).await?;
-        fulfil(connection, id, None).await?;
+        fulfil(connection, id, &[]).await?;
     }
     Ok(())
 }

@@ -15,8 +15,9 @@ use crate::rows::{Filter, Page, refuse_if_used};
 use crate::tables::keys::Made;
 use crate::tables::requests::{self, Request};
 use engine::job::{
-    CalibrationId, Dispersion, Finding, InvalidId, JobModel, Lab, Label, MeasurementId, ModelFacts,
-    ModelId, Mosaic, Reading, Sequence, Sha256, ThingId, Timestamp,
+    CalibrationId, CalibrationRequest, CorrectedMasks, Dispersion, Finding, InvalidId, JobModel,
+    Lab, Label, MaskInputs, MeasurementId, MeasurementInputs, MeasurementRequest, ModelFacts,
+    ModelId, ModelRequest, Mosaic, Reading, Sequence, Sha256, ThingId, Timestamp,
 };
 
 /// The identifier of a calibration, a measurement or a model.
@@ -24,22 +25,27 @@ pub trait Resource:
     Copy + Debug + Display + Send + Sync + Into<ThingId> + From<ThingId> + FromStr<Err = InvalidId>
 {
     const KIND: Made;
+    /// The request for one.
+    type Request: Debug + Clone + PartialEq + Serialize + DeserializeOwned + Send + Sync;
     /// The facts that are known once it has passed its check.
     type Facts: Debug + Clone + PartialEq + Serialize + DeserializeOwned + Send + Sync;
 }
 
 impl Resource for CalibrationId {
     const KIND: Made = Made::Calibration;
+    type Request = CalibrationRequest;
     type Facts = NewCalibration;
 }
 
 impl Resource for MeasurementId {
     const KIND: Made = Made::Measurement;
+    type Request = MeasurementRequest;
     type Facts = NewMeasurement;
 }
 
 impl Resource for ModelId {
     const KIND: Made = Made::Model;
+    type Request = ModelRequest;
     type Facts = NewModel;
 }
 
@@ -52,6 +58,7 @@ pub struct Thing<Id: Resource> {
     /// out, as planar f32. For a model: the hash of its ONNX file.
     pub prepared: Sha256,
     pub created_at: Timestamp,
+    pub request: Id::Request,
     pub facts: Id::Facts,
 }
 
@@ -74,13 +81,15 @@ impl<Id: Resource> FromRow for Asked<Id> {
         };
         let (id, name) = (row.read::<ThingId>("id")?.into(), row.read("name")?);
         let (prepared, created_at) = (row.read("prepared")?, row.read("created_at")?);
-        Ok(Self::Ready(Thing { id, name, prepared, created_at, facts }))
+        let Json(request) = row.read("request")?;
+        Ok(Self::Ready(Thing { id, name, prepared, created_at, request, facts }))
     }
 }
 
 /// Facts of a calibration whose masks have passed their check.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NewCalibration {
+    /// Hash of the upload, or of the npy file of masks that the service has made.
     pub masks: Sha256,
     pub format: String,
     pub sample: String,
@@ -102,6 +111,9 @@ pub struct NewCalibration {
     pub reading: Option<Reading>,
     /// Displacement of the bands of a spectral camera, with which the masks were made of one mask.
     pub dispersion: Option<Dispersion>,
+    /// The registration that has corrected the masks, and their origin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub corrected: Option<CorrectedMasks>,
 }
 
 /// Facts of a measurement that has passed its check.
@@ -139,6 +151,21 @@ pub struct NewModel {
     pub file: Sha256,
     #[serde(flatten)]
     pub facts: ModelFacts,
+}
+
+impl Calibration {
+    /// The origin of the masks.
+    pub fn inputs(&self) -> MaskInputs {
+        let NewCalibration { masks, axes, corrected, .. } = &self.facts;
+        self.request.inputs(*masks, axes.clone(), corrected.clone())
+    }
+}
+
+impl Measurement {
+    /// The origin of the snapshots.
+    pub fn inputs(&self) -> MeasurementInputs {
+        self.request.inputs(self.facts.axes.clone())
+    }
 }
 
 impl From<Model> for JobModel {
@@ -289,11 +316,11 @@ fn users(what: Made) -> &'static [(&'static str, &'static str)] {
     }
 }
 
-/// Records the facts of a thing that has passed its check. Only `source` of its uploads stays in use.
+/// Records the facts of a thing that has passed its check.
 pub async fn record<Id: Resource>(
     connection: &mut SqliteConnection,
     id: Id,
-    (prepared, source): (Sha256, Sha256),
+    prepared: Sha256,
     facts: &Id::Facts,
 ) -> Result<()> {
     let thing: ThingId = id.into();
@@ -303,5 +330,6 @@ pub async fn record<Id: Resource>(
     )
     .execute(&mut *connection)
     .await?;
-    requests::fulfil(connection, thing, Some(source)).await
+    let kept = requests::find(connection, thing).await?.submission.kept_uploads();
+    requests::fulfil(connection, thing, &kept).await
 }

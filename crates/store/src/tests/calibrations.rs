@@ -86,6 +86,7 @@ impl Lab {
             mosaic: None,
             reading: None,
             dispersion: None,
+            corrected: None,
         };
         let done = CalibrationDone { masks: Some((facts, masks)), ..report() };
         let completion = Completion {

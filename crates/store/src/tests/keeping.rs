@@ -6,8 +6,13 @@ use std::time::Duration;
 use futures_util::FutureExt;
 
 use super::Lab;
-use crate::{Checked, Inserted, JobFilter, NewModel, StoreError};
-use engine::job::{JobId, ModelFacts, ModelId, ModelRequest, ModelTrial, Submission, Timestamp};
+use crate::{
+    Checked, Inserted, JobFilter, NewCalibration, NewMeasurement, NewModel, Product, StoreError,
+};
+use engine::job::{
+    CalibrationId, CalibrationRequest, JobId, MeasurementId, MeasurementRequest, ModelFacts,
+    ModelId, ModelRequest, ModelTrial, Submission, Timestamp,
+};
 
 #[tokio::test]
 async fn a_key_makes_one_job() {
@@ -72,6 +77,48 @@ async fn used_things_are_kept_and_unused_ones_collected() {
 fn walk(folder: &std::path::Path) -> Vec<std::path::PathBuf> {
     let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
     entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
+}
+
+#[tokio::test]
+async fn dark_frames_and_maps_are_kept_while_something_was_made_with_them() {
+    let lab = Lab::new().await;
+    let local = engine::job::Lab::local();
+    let mut uploads = Vec::new();
+    for content in [&b"masks with a map"[..], b"map", b"bright data", b"dark"] {
+        uploads.push(lab.upload(content).await);
+    }
+    let [masks, map, data, dark] = uploads[..] else { panic!() };
+    let prepared = |content: &str| match lab.blob(content) {
+        Product::File(staged) => staged,
+        _ => panic!(),
+    };
+    let measured = lab.store.measurement(&local, lab.measurement).await.unwrap().facts;
+    let calibrated = lab.store.calibration(&local, measured.calibration).await.unwrap().facts;
+    let asked = CalibrationRequest {
+        masks: Some(masks),
+        bad_pixels: Some(map),
+        ..CalibrationRequest::default()
+    };
+    let passed = Checked::Masks(NewCalibration { masks, ..calibrated }, prepared("masks"));
+    let calibration: CalibrationId = lab.make(Submission::Calibration(asked), passed).await;
+    lab.work_off().await;
+    let dark_frames = vec![dark];
+    let asked = MeasurementRequest {
+        dark: dark_frames.clone(),
+        ..MeasurementRequest::new(None, calibration, data)
+    };
+    let facts = NewMeasurement { calibration, data, dark: dark_frames, ..measured };
+    let passed = Checked::Measurement(facts, prepared("snapshots"));
+    let measurement: MeasurementId = lab.make(Submission::Measurement(asked), passed).await;
+    let soon = Timestamp(Timestamp::now().0 + 1000);
+    assert_eq!(lab.store.collect(soon).await.unwrap(), []);
+    for upload in [masks, map, data, dark] {
+        let refused = lab.store.delete_upload(&local, upload).await;
+        assert!(matches!(refused, Err(StoreError::FileInUse(_))), "{refused:?}");
+    }
+    lab.store.delete(&local, measurement).await.unwrap();
+    lab.store.delete(&local, calibration).await.unwrap();
+    assert_eq!(lab.store.collect(soon).await.unwrap().len(), 4);
 }
 
 #[tokio::test]
