@@ -112,13 +112,8 @@ pub fn register<E: From<ReconError>>(
     let Some(grid) = search.grid(0, best, fine)? else { return Ok(None) };
     let grids = [grid];
     let turned = search.fit(best, &grids, fine, Free::All);
-    let centre = best.motion.shift;
     best.motion = search.fit(best, &grids, fine, Free::Shift).minimum;
-    let motion = if turned.has_turned { turned.minimum } else { best.motion };
-    let correction = Correction { motion, ..best };
-    let [grid] = grids;
-    let start = Start { correction, has_turned: turned.has_turned, centre, grid };
-    if let Some(found) = search.similarity(start, read)? {
+    if let Some(found) = search.similarity(best, turned, read)? {
         return Ok(Some(found));
     }
     search.pieces.truncate(1);
@@ -245,17 +240,6 @@ impl Piece {
     }
 }
 
-/// The estimate from the first piece alone.
-struct Start {
-    correction: Correction,
-    /// True if its rotation and growth are significant.
-    has_turned: bool,
-    /// The errors of the piece on a fine grid.
-    grid: Grid,
-    /// The shift at the centre of this grid.
-    centre: [f64; 2],
-}
-
 struct Search<'a> {
     plan: &'a Plan,
     /// The first piece of the plan, and others.
@@ -351,16 +335,20 @@ impl<'a> Search<'a> {
         Ok(best.1)
     }
 
-    /// Estimates rotation and growth too. `None` if they are not significant, or if they predict other pixels no better than
-    /// a shift.
+    /// Estimates rotation and growth too, after the first piece has given a shift and, `turned`, all parameters. `None` if
+    /// they are not significant, or if they predict other pixels no better than a shift.
     fn similarity<E: From<ReconError>>(
         &mut self,
-        Start { correction: mut best, mut has_turned, centre, grid }: Start,
+        mut best: Correction,
+        turned: Fit,
         read: impl Fn(&Place) -> Result<Piece, E>,
     ) -> Result<Option<Registration>, E> {
-        let fine = STEPS[1];
+        let fine = LAST_STEPS[0];
         let plan = self.plan;
-        let mut first = Some(grid);
+        let mut has_turned = turned.has_turned;
+        if has_turned {
+            best.motion = turned.minimum;
+        }
         for places in &plan.others {
             self.pieces.truncate(1);
             for place in places {
@@ -369,17 +357,7 @@ impl<'a> Search<'a> {
             if self.pieces.len() == 1 {
                 break;
             }
-            let grid = match first.take() {
-                Some(grid) => {
-                    let shift = best.motion.shift;
-                    let centre = [centre[0] - shift[0], centre[1] - shift[1]];
-                    Grid { centre, ..grid }
-                }
-                None => {
-                    let Some(grid) = self.grid(0, best, fine)? else { return Ok(None) };
-                    grid
-                }
-            };
+            let Some(grid) = self.grid(0, best, fine)? else { return Ok(None) };
             let mut grids = vec![grid];
             while grids.len() < self.pieces.len() {
                 match self.local_grid(grids.len(), best)? {
@@ -413,7 +391,7 @@ impl<'a> Search<'a> {
 
     /// The errors of a piece on a fine grid around a displacement that fits it alone. `None` if it has no light.
     fn local_grid(&mut self, piece: usize, best: Correction) -> Result<Option<Grid>> {
-        let [coarse, fine] = STEPS;
+        let (coarse, fine) = (STEPS[0], LAST_STEPS[0]);
         let mut local = best;
         for _ in 0..MAX_COARSE_GRIDS {
             let Some(grid) = self.grid(piece, local, coarse)? else { return Ok(None) };
