@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
 use crate::pipeline::values;
-use crate::samples::{Scene, npy};
+use crate::samples::{Scene, constant, npy};
 
 const SIDE: usize = 144;
 const PIXELS: usize = SIDE * SIDE;
@@ -49,8 +49,9 @@ fn snapshot(masks: &[f32]) -> Vec<f32> {
         0.45 + 0.2 * (column * 0.2).sin() * (row * 0.15).cos()
             + 0.1 * (column * 0.31 + row * 0.27).sin()
     };
-    let y = |at: usize| (0..masks.len() / PIXELS).map(|k| masks[k * PIXELS + at] * pixel(k, at));
-    (0..PIXELS).map(|at| y(at).sum()).collect()
+    let frames = masks.len() / PIXELS;
+    let y = |at: usize| (0..frames).map(|k| masks[k * PIXELS + at] * pixel(k, at)).sum();
+    (0..PIXELS).map(y).collect()
 }
 
 /// Masks that are enlarged by a factor about the middle of the picture.
@@ -247,8 +248,9 @@ async fn a_missing_mask_is_named_before_the_dark() {
     let app = TestApp::with(&["--workers", "1"]).await;
     let (mut masks, y) = scene();
     masks.truncate((FRAMES - 1) * PIXELS);
-    let calibration = app.calibrate(npy(&[FRAMES - 1, SIDE, SIDE], masks)).await.expect(201);
-    let data = app.upload(npy(&[SIDE, SIDE], y)).await;
+    let calibration =
+        app.calibrate(npy(&[FRAMES - 1, SIDE, SIDE], masks.into_iter())).await.expect(201);
+    let data = app.upload(npy(&[SIDE, SIDE], y.into_iter())).await;
     let body = json!({"calibration": id(&calibration), "data": data});
     let measurement = app.post("/v1/measurements", &body).await.expect(201).json();
     assert_eq!(measurement["warnings"][0]["code"], "missing_mask", "{measurement:#}");
@@ -273,7 +275,7 @@ async fn masks_of_another_size_get_the_likely_cause() {
     let calibration = id(&app.calibrate(scene.masks()).await.expect(201));
     for (shape, cause) in [([64, 48], "90 degrees"), ([96, 128], "binned"), ([48, 96], "`packing`")]
     {
-        let data = app.upload(npy(&shape, vec![1.0; shape[0] * shape[1]])).await;
+        let data = app.upload(constant(&shape, 1.0)).await;
         let body = json!({"calibration": calibration, "data": data});
         let refused = app.post("/v1/measurements", &body).await.problem(422, "size_mismatch");
         assert!(refused.contains(cause), "{refused}");
