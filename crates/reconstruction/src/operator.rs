@@ -123,11 +123,6 @@ impl SensingOperator {
         (1.0 - self.static_gram().sum() / self.gram.sum()).max(0.0)
     }
 
-    /// True if masks differ enough for a measurement to distinguish changes from the static part of the frames.
-    pub(super) fn has_high_contrast(&self) -> bool {
-        self.contrast() >= HIGH_CONTRAST
-    }
-
     /// The static part of the Gram diagonal \[H,W\]: `B` times the square of the mean mask.
     pub(super) fn static_gram(&self) -> Array2<f32> {
         let frames = self.masks.dim().0 as f32;

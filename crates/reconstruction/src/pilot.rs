@@ -7,7 +7,7 @@
 //! rises at the start of a stage whose noise level is far above the remaining error, and falls again with that level. So a
 //! stage is run to its end before it is judged.
 //!
-//! Stage by stage, the candidates of a small grid (`GRID`) replace the planned settings where their smallest hold-out error
+//! Stage by stage, the candidates of a grid (`GRID`) replace the planned settings where their smallest hold-out error
 //! is significantly smaller. The last stage then ends early where its error is smallest.
 
 use std::ops::ControlFlow;
@@ -26,94 +26,58 @@ use super::priors::Networks;
 use super::progress::Observer;
 use super::projection::Problem;
 use super::schedule::{Heuristic, Schedule};
-use super::stage::{MAX_STATIC_VARIANCE, Stage};
+use super::stage::Stage;
 use super::trial::{Trial, is_strong, temporal_shrinkage};
 use super::unmeasured::Measured;
 
 /// A candidate that trails by this t-statistic after half of its iterations is abandoned.
 const ABANDON_T: f64 = 2.0;
 
-/// Settings that are tried in place of the planned ones.
-struct Candidate {
-    heuristic: Heuristic,
-    /// Factor of the planned value; for the noise term the value, in units of the variance of the slowest change.
-    value: f32,
-    after: Condition,
-}
-
-/// Outcome of a heuristic's first candidate for which a candidate is tried.
-#[derive(Clone, Copy, PartialEq)]
-enum Condition {
-    /// The candidate is a first one.
-    Any,
-    Accepted,
-    Rejected,
-    /// Rejected, but not abandoned.
-    NarrowlyRejected,
-}
-
-const fn candidate(heuristic: Heuristic, value: f32, after: Condition) -> Candidate {
-    Candidate { heuristic, value, after }
-}
-
-/// The candidates, in the order of their trial.
-const GRID: [Candidate; 9] = [
-    candidate(Heuristic::TemporalVariation, 0.0, Condition::Any),
-    candidate(Heuristic::TemporalShrinkage, 4.0, Condition::Any),
-    candidate(Heuristic::TemporalShrinkage, 8.0, Condition::Accepted),
-    candidate(Heuristic::TemporalShrinkage, 2.0, Condition::NarrowlyRejected),
-    candidate(Heuristic::StaticVariance, 2.0, Condition::Any),
-    candidate(Heuristic::StaticVariance, 0.0, Condition::Any),
-    candidate(Heuristic::NoiseTerm, 1.0, Condition::Any),
-    candidate(Heuristic::NoiseTerm, 3.0, Condition::Accepted),
-    candidate(Heuristic::NoiseTerm, 0.3, Condition::Rejected),
+/// The settings that are tried in place of the planned ones. The values of a heuristic are tried in their order, until one is
+/// not accepted. They are factors of the planned value, where 0 drops the setting; those of the noise term are in units of
+/// the variance of the slowest change.
+const GRID: [(Heuristic, &[f32]); 4] = [
+    (Heuristic::TemporalVariation, &[0.0]),
+    (Heuristic::TemporalShrinkage, &[4.0, 8.0]),
+    (Heuristic::StaticVariance, &[0.0]),
+    (Heuristic::NoiseTerm, &[1.0, 3.0]),
 ];
 
-impl Candidate {
-    /// True if the planned stage has the setting that the candidate changes.
-    fn applies_to(&self, planned: &Stage) -> bool {
-        let projection = planned.projection;
-        match self.heuristic {
-            Heuristic::TemporalVariation => {
-                planned.prior.tv().is_some_and(|tv| tv.temporal_weight > 0.0)
-            }
-            Heuristic::TemporalShrinkage => temporal_shrinkage(planned) > 0.0,
-            Heuristic::StaticVariance => projection.static_variance.is_some(),
-            Heuristic::NoiseTerm => {
-                projection.static_variance.is_some() && projection.gamma.is_none()
-            }
-            Heuristic::EarlyStopping | Heuristic::StaticScene | Heuristic::StaticRegions => false,
+/// True if the planned stage has the setting that a heuristic changes.
+fn applies(heuristic: Heuristic, planned: &Stage) -> bool {
+    let projection = planned.projection;
+    match heuristic {
+        Heuristic::TemporalVariation => {
+            planned.prior.tv().is_some_and(|tv| tv.temporal_weight > 0.0)
         }
+        Heuristic::TemporalShrinkage => temporal_shrinkage(planned) > 0.0,
+        Heuristic::StaticVariance => projection.static_variance.is_some(),
+        Heuristic::NoiseTerm => projection.static_variance.is_some() && projection.gamma.is_none(),
+        Heuristic::EarlyStopping | Heuristic::StaticScene | Heuristic::StaticRegions => false,
     }
+}
 
-    /// The stage to be tried in place of the best one, if the candidate can be better.
-    fn apply(&self, planned: &Stage, best: &Trial, op: &SensingOperator) -> Option<Stage> {
-        let mut stage = best.stage.clone();
-        match self.heuristic {
-            _ if !self.applies_to(planned) => return None,
-            Heuristic::TemporalVariation => stage.prior.tv_mut()?.temporal_weight *= self.value,
-            Heuristic::TemporalShrinkage => {
-                stage.prior.nonlocal_mut()?.temporal_shrinkage =
-                    self.value * temporal_shrinkage(planned);
-            }
-            // For masks of high contrast the planned value is the largest useful one.
-            Heuristic::StaticVariance if self.value > 1.0 && op.has_high_contrast() => return None,
-            Heuristic::StaticVariance => {
-                let variance = self.value * planned.projection.static_variance?;
-                stage.projection.static_variance =
-                    (variance > 0.0).then_some(variance.min(MAX_STATIC_VARIANCE));
-            }
-            // Noise raises the error long before the stage ends. Without noise a term only costs.
-            Heuristic::NoiseTerm
-                if self.after != Condition::Accepted
-                    && best.best_iteration() * 10 > planned.iterations * 9 =>
-            {
-                return None;
-            }
-            _ => stage.projection.gamma = Some(self.value),
-        }
-        Some(stage)
+/// The stage to be tried in place of the best one, if it can be better.
+fn candidate(heuristic: Heuristic, value: f32, planned: &Stage, best: &Trial) -> Option<Stage> {
+    if !applies(heuristic, planned) {
+        return None;
     }
+    let mut stage = best.stage.clone();
+    match heuristic {
+        Heuristic::TemporalVariation => stage.prior.tv_mut()?.temporal_weight *= value,
+        Heuristic::TemporalShrinkage => {
+            stage.prior.nonlocal_mut()?.temporal_shrinkage = value * temporal_shrinkage(planned);
+        }
+        Heuristic::StaticVariance => stage.projection.static_variance = None,
+        // Noise raises the error long before the stage ends. Without noise a term only costs.
+        _ if stage.projection.gamma.is_none()
+            && best.best_iteration() * 10 > planned.iterations * 9 =>
+        {
+            return None;
+        }
+        _ => stage.projection.gamma = Some(value),
+    }
+    Some(stage)
 }
 
 /// Decisions of the pilot on one stage, with their evidence.
@@ -217,32 +181,21 @@ impl Judge<'_> {
         let planned = planned.without_static_regions();
         let mut best = self.run(solver, index, &planned, None)?;
         let mut weakly_shrunk = None;
-        let mut first: Option<(Heuristic, Condition)> = None;
-        for candidate in GRID.iter().filter(|candidate| schedule.has(candidate.heuristic)) {
-            let own = first.filter(|(heuristic, _)| *heuristic == candidate.heuristic);
-            if !candidate.after.holds(own.map(|(_, outcome)| outcome)) {
-                continue;
-            }
-            let Some(stage) = candidate.apply(&planned, &best, self.op) else { continue };
-            let end = solver.iterate.snapshot();
-            solver.iterate.restore(start.snapshot());
-            let trial = self.run(solver, index, &stage, Some(&best))?;
-            let outcome = match trial.is_better_than(&best, schedule) {
-                true => Condition::Accepted,
-                false if trial.abandoned => Condition::Rejected,
-                false => Condition::NarrowlyRejected,
-            };
-            if candidate.after == Condition::Any {
-                first = Some((candidate.heuristic, outcome));
-            }
-            if outcome != Condition::Accepted {
-                solver.iterate.restore(end);
-                continue;
-            }
-            let is_static = best.is_static || trial.indicates_static_scene(&best, schedule);
-            let replaced = std::mem::replace(&mut best, Trial { is_static, ..trial });
-            if is_strong(best.shrinkage(), replaced.shrinkage()) {
-                weakly_shrunk = replaced.best_frames;
+        for (heuristic, values) in GRID.iter().filter(|(heuristic, _)| schedule.has(*heuristic)) {
+            for value in *values {
+                let Some(stage) = candidate(*heuristic, *value, &planned, &best) else { break };
+                let end = solver.iterate.snapshot();
+                solver.iterate.restore(start.snapshot());
+                let trial = self.run(solver, index, &stage, Some(&best))?;
+                if !trial.is_better_than(&best, schedule) {
+                    solver.iterate.restore(end);
+                    break;
+                }
+                let is_static = best.is_static || trial.indicates_static_scene(&best, schedule);
+                let replaced = std::mem::replace(&mut best, Trial { is_static, ..trial });
+                if is_strong(best.shrinkage(), replaced.shrinkage()) {
+                    weakly_shrunk = replaced.best_frames;
+                }
             }
         }
         Ok((best, weakly_shrunk.filter(|_| schedule.has(Heuristic::StaticRegions))))
@@ -280,17 +233,6 @@ impl Judge<'_> {
             }
         }
         Ok(trial)
-    }
-}
-
-impl Condition {
-    /// True if a candidate with this condition is tried after this outcome of the first one.
-    fn holds(self, outcome: Option<Self>) -> bool {
-        match self {
-            Self::Any => true,
-            Self::Accepted | Self::NarrowlyRejected => outcome == Some(self),
-            Self::Rejected => outcome.is_some_and(|outcome| outcome != Self::Accepted),
-        }
     }
 }
 
@@ -348,13 +290,10 @@ fn restrict_to_static_regions(
 impl Schedule {
     /// Largest cost of a pilot, CPU-nanoseconds per voxel of the crop.
     pub fn pilot_ns_per_voxel(&self) -> f64 {
-        // One of two candidates with opposite conditions is tried.
-        let tried = |candidate: &&Candidate| {
-            matches!(candidate.after, Condition::Any | Condition::Accepted)
-                && self.has(candidate.heuristic)
-        };
         let trials = |stage: &Stage| {
-            1 + GRID.iter().filter(tried).filter(|candidate| candidate.applies_to(stage)).count()
+            let tried = GRID.iter().filter(|(heuristic, _)| self.has(*heuristic));
+            let values = tried.filter(|(heuristic, _)| applies(*heuristic, stage));
+            1 + values.map(|(_, values)| values.len()).sum::<usize>()
         };
         self.stages.iter().map(|stage| stage.planned_ns() * trials(stage) as f64).sum()
     }

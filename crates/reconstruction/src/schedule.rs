@@ -63,13 +63,13 @@ pub enum Heuristic {
     EarlyStopping,
     /// Drops total variation along time.
     TemporalVariation,
-    /// Multiplies temporal_shrinkage by 2, 4 or 8.
+    /// Multiplies temporal_shrinkage by 4, then by 8.
     TemporalShrinkage,
     /// Accepts strong shrinkage that removes nearly all temporal change, unless it is clearly worse.
     StaticScene,
     /// Applies strong shrinkage to static regions only.
     StaticRegions,
-    /// Doubles or drops static_variance.
+    /// Drops static_variance.
     StaticVariance,
     /// Adds a noise term gamma.
     NoiseTerm,

@@ -49,20 +49,17 @@ pub struct ProjectionSpec {
     /// Variance of the error that all frames of a snapshot share, in units of the variance of its slowest change. It
     /// sets the covariance R of the frames' errors: DCT coefficient m along time has this variance for m = 0, and
     /// m^-0.4 from m = 1 on. It holds for Cr 10 and masks of high contrast; the projection scales it for others
-    /// (docs/ALGORITHM.md). With null, R = 1. An adaptive schedule doubles it or sets null where that is better.
+    /// (docs/ALGORITHM.md). With null, R = 1. An adaptive schedule sets null where that is better.
     #[serde(default)]
-    #[schemars(range(min = 0.01, max = MAX_STATIC_VARIANCE))]
+    #[schemars(range(min = 0.01, max = 2.0))]
     pub static_variance: Option<f32>,
     /// Noise term of this stage in place of the schedule's: variance of the noise of a measured pixel, in units of the
-    /// variance of the slowest change of the frames' error. With null, an adaptive schedule tries 0.3, 1 and 3 in a
+    /// variance of the slowest change of the frames' error. With null, an adaptive schedule tries 1, then 3, in a
     /// stage with static_variance.
     #[serde(default)]
     #[schemars(range(min = 0.0, max = 1e6))]
     pub gamma: Option<f32>,
 }
-
-/// Largest static variance.
-pub(crate) const MAX_STATIC_VARIANCE: f32 = 2.0;
 
 /// Cost of a projection with its extrapolation, CPU-nanoseconds per voxel (see [`super::priors::Spec::iteration_ns`]).
 const PROJECTION_NS: f64 = 0.7;

@@ -7,10 +7,6 @@ use super::schedule::{Heuristic, Schedule};
 use super::stage::Stage;
 use super::static_regions::temporal_correlation;
 
-/// The last iteration with an error this close to the smallest is the end, relative to that error. Where the error hardly
-/// changes, the frames often still improve: in doubt the schedule goes on.
-const EARLY_STOPPING_SLACK: f64 = 0.005;
-
 /// Largest t-statistic of the final against the smallest error for which the full schedule is run. Overfitting costs far more
 /// than the error shows.
 const MAX_FULL_SCHEDULE_T: f64 = 1.5;
@@ -89,15 +85,12 @@ impl Trial {
     }
 
     /// Number of iterations to be run: all, unless the final error is significantly above the smallest; else those up to the
-    /// last error near the smallest.
+    /// smallest.
     pub(crate) fn early_stopping_iteration(&self) -> usize {
         let complete = !self.diverged && self.errors.len() == self.stage.iterations;
         let last = self.squares.last().map_or(&[][..], Vec::as_slice);
-        if complete && t_statistic(last, self.best_squares()) <= MAX_FULL_SCHEDULE_T {
-            return self.errors.len();
-        }
-        let limit = self.smallest_error() * (1.0 + EARLY_STOPPING_SLACK);
-        self.errors.iter().rposition(|error| *error <= limit).map_or(0, |index| index + 1)
+        let in_full = complete && t_statistic(last, self.best_squares()) <= MAX_FULL_SCHEDULE_T;
+        if in_full { self.errors.len() } else { self.best_iteration() }
     }
 
     /// The frames of the result. With noise the smallest error may come first, when little is shrunk.

@@ -33,8 +33,8 @@ pub struct NonlocalSpec {
     #[schemars(transform = noise_levels)]
     pub sigma: [f32; 2],
     /// Temporal shrinkage: DCT-II coefficients of a pixel along time, with mean square e over 5x5 pixels, lose the share
-    /// l^4 / (l^4 + e^2), where l is temporal_shrinkage times sigma; 0 for none. An adaptive schedule multiplies it by 2,
-    /// 4 or 8 where that is better.
+    /// l^4 / (l^4 + e^2), where l is temporal_shrinkage times sigma; 0 for none. An adaptive schedule multiplies it by 4,
+    /// then by 8, where that is better.
     #[serde(default)]
     #[schemars(range(min = 0.0, max = 1e6))]
     pub temporal_shrinkage: f32,
