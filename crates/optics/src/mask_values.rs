@@ -36,8 +36,8 @@ const LIGHT_OF_A_MASK: std::ops::RangeInclusive<f64> = 0.4..=1.7;
 /// Slope from which unexplained light follows the scene. Of 30 scenes, right masks have at most 1.02 with any dark, binary
 /// ones that were grey at least 1.05. A missing mask gives 0.97 to 1.22.
 const FOLLOWS_THE_SCENE: f64 = 1.035;
-/// Residual of the plainest blocks that a missing mask leaves, relative to the energy of a mask.
-const RESIDUAL_OF_A_MASK: std::ops::RangeInclusive<f64> = 0.75..=1.3;
+/// Smallest residual of the plainest blocks that a missing mask leaves, relative to the energy of a mask.
+const MIN_RESIDUAL_OF_A_MASK: f64 = 0.75;
 /// Masks are independent if they have this share of the energy of their sum, and resemble one another below the second
 /// share, as grey masks do that are made binary.
 const INDEPENDENT: f64 = 0.5;
@@ -96,7 +96,8 @@ pub(super) fn alteration(observed: &Observed<'_>) -> Option<Alteration> {
     }
     let is_mask = LIGHT_OF_A_MASK.contains(&(share / expected))
         && independence > INDEPENDENT
-        && (follows_the_scene || RESIDUAL_OF_A_MASK.contains(&residual));
+        && follows_the_scene
+        && residual > MIN_RESIDUAL_OF_A_MASK;
     is_mask.then_some(Alteration::MissingMask)
 }
 

@@ -130,9 +130,9 @@ pub(super) fn brightness_errors(
         scatter += &scores.dot(&scores.t());
     }
     let between_blocks = fit.inverse.dot(&scatter).dot(&fit.inverse);
-    let of_pixels = weighted_scatter(strips, &fit.brightness, weights);
+    let pixel_variance = weighted_scatter(strips, &fit.brightness, weights);
     let variances = between_blocks.diag().into_iter().zip(fit.inverse.diag());
-    variances.map(|(blocks, share)| blocks.max(of_pixels * share).max(0.0).sqrt()).collect()
+    variances.map(|(blocks, share)| blocks.max(pixel_variance * share).max(0.0).sqrt()).collect()
 }
 
 /// Weighted mean squared residual of the blocks: the variance of a pixel in a block of weight 1.
