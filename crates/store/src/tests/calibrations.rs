@@ -128,6 +128,11 @@ async fn a_calibration_precedes_every_job_and_is_visible() {
     let made = lab.store.calibration(&local, first).await.unwrap();
     assert_eq!((made.created_at, made.facts.frames), (shown.created_at, 2));
     assert_eq!(made.facts.mosaic, Some(Mosaic::Gbrg), "as it was asked for");
+    let inputs = made.inputs();
+    assert_eq!(
+        (inputs.masks_sha256, inputs.captures),
+        (made.facts.masks, calibration.captures.clone())
+    );
     assert!(lab.store.report(first).await.unwrap().is_some());
     assert_eq!(lab.store.map(first, "mean").await.unwrap().unwrap(), b"png");
     let done = |kind: &str| kind == "calibration";
