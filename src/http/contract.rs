@@ -502,7 +502,9 @@ mod tests {
                 list.push(name);
             }
         }
-        assert!(public.len() <= 56, "{} operations: {public:#?}", public.len());
+        // OPTIONS only tells which extensions of tus there are.
+        let acting = public.iter().filter(|name| !name.starts_with("options")).count();
+        assert!(acting <= 55, "{acting} operations: {public:#?}");
         assert!(internal.iter().all(|name| !name.contains("/v1/")), "{internal:#?}");
         assert!(public.iter().all(|name| !name.contains("/view/")), "{public:#?}");
     }
