@@ -14,11 +14,13 @@ mod webhooks;
 /// One of the variables is set, but there is no certificate in its place.
 pub fn http_client() -> Result<reqwest::ClientBuilder, String> {
     let found = rustls_native_certs::load_native_certs();
+    let file = std::env::var_os("SSL_CERT_FILE").filter(|file| !file.is_empty());
+    let is_lost = file.is_some_and(|file| !std::path::Path::new(&file).is_file());
     let stated = ["SSL_CERT_FILE", "SSL_CERT_DIR"].into_iter().find_map(|variable| {
         let place = std::env::var_os(variable).filter(|place| !place.is_empty())?;
         Some(format!("{variable} names {}, which has no certificate in PEM form", place.display()))
     });
-    if let Some(stated) = stated.filter(|_| found.certs.is_empty()) {
+    if let Some(stated) = stated.filter(|_| is_lost || found.certs.is_empty()) {
         let reasons: Vec<String> = found.errors.iter().map(ToString::to_string).collect();
         let reasons = if reasons.is_empty() {
             reasons.concat()

@@ -502,7 +502,7 @@ mod tests {
                 list.push(name);
             }
         }
-        // OPTIONS only tells which extensions of tus there are.
+        // OPTIONS lists the extensions of tus and does nothing else.
         let acting = public.iter().filter(|name| !name.starts_with("options")).count();
         assert!(acting <= 55, "{acting} operations: {public:#?}");
         assert!(internal.iter().all(|name| !name.contains("/v1/")), "{internal:#?}");

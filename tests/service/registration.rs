@@ -218,7 +218,7 @@ async fn corrected_masks_become_a_calibration() {
     assert_eq!(inputs["masks_sha256"], sha256(&npy));
     let origin = &inputs["registration_of"];
     assert_eq!(origin["job"], auto["id"], "{inputs:#}");
-    assert_eq!(origin["shift"], auto["registered"]["shift"], "{inputs:#}");
+    assert_eq!(origin["motion"]["shift"], auto["registered"]["shift"], "{inputs:#}");
     assert_eq!(origin["masks_sha256"], sha256(&masks(SCENE)), "{inputs:#}");
 
     let (off, _) = run(&app, &moved, &json!("off")).await;

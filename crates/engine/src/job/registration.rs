@@ -10,16 +10,13 @@ use serde::{Deserialize, Deserializer, Serialize};
 use super::report::{Finding, FindingCode};
 use super::text::InvalidField;
 use reconstruction::registration::{
-    Correction, Interpolation, MAX_GROWTH, MAX_ROTATION, REACH, Registration, Similarity,
+    Correction, Interpolation, Known, MAX_GROWTH, MAX_ROTATION, REACH, Registration, Similarity,
     Uncertainty,
 };
 
 /// Reason where an estimate is not reliable.
 const NOT_CONVERGED: &str = "no shift by at most 4 pixels, also with a small rotation or magnification, makes the masks explain the \
      measurement well enough, so they were not moved";
-
-/// A stated motion explains the measurement better if it lowers the squared hold-out error to this share.
-const BETTER: f64 = 0.9;
 
 /// Share of the light without a mask from which moved masks are reported as misplaced.
 const MISPLACED: f64 = 0.25;
@@ -125,6 +122,10 @@ pub struct Registered {
     pub error_before: Option<f64>,
     /// Relative squared error at these pixels with the moved masks; null if it is unknown.
     pub error_after: Option<f64>,
+    /// For a stated motion, whether the masks explain the measurement with it, or at least better than without; null if it is
+    /// unknown, and for an estimate. The errors alone do not show it: interpolation lowers the contrast of masks, and so their error.
+    #[serde(default)]
+    pub explains: Option<bool>,
     /// True if the job uses the moved masks. False if the calibrated masks fit, or if there is a `reason`.
     pub applied: bool,
     /// Why nothing was estimated, or why the estimate is unreliable; null otherwise.
@@ -135,12 +136,11 @@ pub struct Registered {
 }
 
 impl Registered {
-    /// The outcome of a motion that the request states, with the errors without and with it.
-    pub fn stated(
-        Correction { motion, interpolation }: Correction,
-        errors: Option<[f64; 2]>,
-    ) -> Self {
-        let (error_before, error_after) = (errors.map(|it| it[0]), errors.map(|it| it[1]));
+    /// The outcome of a motion that the request states.
+    pub fn stated(motion: Similarity, Known { interpolation, outcome }: Known) -> Self {
+        let (error_before, error_after) =
+            (outcome.map(|(errors, _)| errors[0]), outcome.map(|(errors, _)| errors[1]));
+        let explains = outcome.map(|(_, explains)| explains);
         let Similarity { shift, rotation, scale } = motion;
         let applied = motion != Similarity::default();
         let skipped = Self::skipped("the motion was stated");
@@ -152,6 +152,7 @@ impl Registered {
             applied,
             error_before,
             error_after,
+            explains,
             ..skipped
         }
     }
@@ -167,6 +168,7 @@ impl Registered {
             uncertainty: None,
             error_before: None,
             error_after: None,
+            explains: None,
             applied: false,
             reason: Some(reason.to_owned()),
             lost_light: None,
@@ -185,18 +187,12 @@ impl Registered {
     pub fn superseded(&self) -> &'static [FindingCode] {
         const DRIFT: [FindingCode; 3] =
             [FindingCode::DriftedMasks, FindingCode::ShiftedMasks, FindingCode::ForeignMasks];
-        let is_estimate = self.uncertainty.is_some();
-        let explains_more = self.errors().is_none_or(|[before, after]| after < BETTER * before);
-        match (self.applied, is_estimate, explains_more) {
+        match (self.applied, self.uncertainty.is_some(), self.explains) {
             (true, true, _) => &DRIFT,
             // Nothing has tested a stated motion against masks of another camera.
-            (true, false, true) => &DRIFT[..2],
-            (false, ..) | (true, false, false) => &[],
+            (true, false, Some(true) | None) => &DRIFT[..2],
+            (false, ..) | (true, false, Some(false)) => &[],
         }
-    }
-
-    fn errors(&self) -> Option<[f64; 2]> {
-        self.error_before.zip(self.error_after).map(|(before, after)| [before, after])
     }
 
     /// True if the white level follows the moved masks. Masks that see too little of the light give no white level, so that
@@ -208,9 +204,9 @@ impl Registered {
     /// The findings on masks that the job has moved.
     pub fn findings(&self) -> Vec<Finding> {
         let Some(Correction { motion, .. }) = self.correction() else { return Vec::new() };
-        let errors = self.errors();
+        let errors = self.error_before.zip(self.error_after);
         let detail = match errors.filter(|_| self.uncertainty.is_some()) {
-            Some([before, after]) => format!(
+            Some((before, after)) => format!(
                 "the masks have moved by {} since the calibration; the job has corrected them, which lowers the hold-out \
                  error from {:.2} to {:.2} %",
                 described(motion, true),
@@ -223,14 +219,10 @@ impl Registered {
             ),
         };
         let mut findings = vec![Finding::new(FindingCode::MovedMasks, detail)];
-        if let Some([before, after]) = errors.filter(|[before, after]| after > before) {
-            let detail = format!(
-                "the stated motion raises the hold-out error from {:.2} to {:.2} %; check its signs (rows downwards, columns \
-                 to the right), or let the job estimate it with auto",
-                100.0 * before.sqrt(),
-                100.0 * after.sqrt()
-            );
-            findings.push(Finding::new(FindingCode::MisplacedMasks, detail));
+        if self.explains == Some(false) {
+            let detail = "the masks explain the measurement no better with the stated motion than without it; check its signs \
+                          (rows downwards, columns to the right), or let the job estimate it with auto";
+            findings.push(Finding::new(FindingCode::MisplacedMasks, detail.to_owned()));
         }
         if let Some(lost) = self.lost_light.filter(|lost| *lost > MISPLACED) {
             let detail = format!(
@@ -282,6 +274,7 @@ impl From<Registration> for Registered {
             uncertainty: Some(uncertainty),
             error_before: Some(error_before),
             error_after: Some(error_after),
+            explains: None,
             applied,
             reason: (!converged).then(|| NOT_CONVERGED.to_owned()),
             lost_light: None,

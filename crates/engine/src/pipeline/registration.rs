@@ -14,7 +14,7 @@ use formats::planar::{self, Reader};
 use formats::validate::MaskStatistics;
 use formats::{FormatError, Limits, StackInfo};
 use reconstruction::ReconError;
-use reconstruction::registration::{self, Correction, Interpolation, Plan};
+use reconstruction::registration::{self, Correction, Interpolation, Known, Plan};
 use reconstruction::tile::Window;
 
 /// Reason for sensors with colours. The planes of a mosaic sample the masks at every second pixel only.
@@ -60,11 +60,11 @@ fn estimate(
 ) -> Result<Registered> {
     let plan = Plan::choose(light, y);
     if let RegistrationRequest::Stated(motion) = request {
-        let (interpolation, errors) = match plan {
+        let known = match plan {
             Some(plan) => registration::known(&plan, y, motion, masks, proceed)?,
-            None => (Interpolation::default(), None),
+            None => Known { interpolation: Interpolation::default(), outcome: None },
         };
-        return Ok(Registered::stated(Correction { motion, interpolation }, errors));
+        return Ok(Registered::stated(motion, known));
     }
     let Some(plan) = plan else { return Ok(Registered::skipped(SMALL)) };
     let found = registration::register(&plan, y, masks, proceed)?;

@@ -121,8 +121,20 @@ pub fn register<E: From<ReconError>>(
     Ok(search.verdict(best, &fit)?)
 }
 
+/// The test of a known motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Known {
+    /// Interpolation of the moved masks.
+    pub interpolation: Interpolation,
+    /// `||y - Hv||^2 / ||y||^2` at hold-out pixels without and with the motion, and whether the masks explain the measurement
+    /// with it, or at least better. `None` if the piece has no light or diverges.
+    pub outcome: Option<([f64; 2], bool)>,
+}
+
+/// A known motion explains a measurement better if it lowers the ratio to the error elsewhere to this share.
+const BETTER: f64 = 0.9;
+
 /// Chooses the interpolation of masks by a known `motion`, and tests this motion, on the first piece as for [`register`].
-/// Returns `||y - Hv||^2 / ||y||^2` without and with the motion; `None` if the piece has no light or diverges.
 ///
 /// # Errors
 /// Those of [`register`].
@@ -132,14 +144,27 @@ pub fn known<E: From<ReconError>>(
     motion: Similarity,
     masks: impl Fn(&Window) -> Result<Array3<f32>, E>,
     proceed: &mut dyn FnMut(f64) -> bool,
-) -> Result<(Interpolation, Option<[f64; 2]>), E> {
+) -> Result<Known, E> {
     let first = Piece::read(plan, &plan.first, y, &masks)?;
     let mut search = Search::new(plan, first, proceed);
     let interpolation = search.interpolation(motion)?;
-    let errors = search.before_and_after(Correction { motion, interpolation })?;
+    let place = Correction { motion, interpolation };
+    let unmoved = Correction { motion: Similarity::default(), interpolation };
     let norm = search.norm();
-    let relative = |errors: Vec<f64>| errors.iter().sum::<f64>() / norm;
-    Ok((interpolation, errors.filter(|_| norm > 0.0).map(|errors| errors.map(relative))))
+    let mut relative = |place: Correction| -> Result<Option<f64>> {
+        let errors = search.deciding_errors(place)?.filter(|_| norm > 0.0);
+        Ok(errors.map(|errors| errors.iter().sum::<f64>() / norm))
+    };
+    let errors = [unmoved, place, unmoved.elsewhere(), place.elsewhere()].map(&mut relative);
+    let [before, after, elsewhere, moved_elsewhere] = errors;
+    let outcome = match (before?, after?, elsewhere?, moved_elsewhere?) {
+        (Some(before), Some(after), Some(elsewhere), Some(moved_elsewhere)) => {
+            let (ratio_before, ratio) = (before / elsewhere, after / moved_elsewhere);
+            Some(([before, after], ratio < EXPLAINED || ratio < BETTER * ratio_before))
+        }
+        _ => None,
+    };
+    Ok(Known { interpolation, outcome })
 }
 
 /// Draws two sets of hold-out pixels of a measurement \[1,h,w\]. No pixel is in both.
@@ -285,14 +310,6 @@ impl<'a> Search<'a> {
         Ok(Some(all))
     }
 
-    /// These errors without and with a motion.
-    fn before_and_after(&mut self, best: Correction) -> Result<Option<[Vec<f64>; 2]>> {
-        let unmoved = Correction { motion: Similarity::default(), ..best };
-        let before = self.deciding_errors(unmoved)?;
-        let after = self.deciding_errors(best)?;
-        Ok(before.zip(after).map(|(before, after)| [before, after]))
-    }
-
     /// The sum of squares of the measurement at these pixels.
     fn norm(&self) -> f64 {
         self.pieces.iter().map(|piece| piece.draws[1].norm(piece.y.view())).sum()
@@ -426,8 +443,13 @@ impl<'a> Search<'a> {
 
     /// Decides on the best motion. The other draw took no part in the search, so its errors are not biased by it.
     fn verdict(&mut self, best: Correction, fit: &Fit) -> Result<Option<Registration>> {
-        let Some([before, after]) = self.before_and_after(best)? else { return Ok(None) };
-        let Some(wrong) = self.deciding_errors(best.elsewhere())? else { return Ok(None) };
+        let unmoved = Correction { motion: Similarity::default(), ..best };
+        let before = self.deciding_errors(unmoved)?;
+        let after = self.deciding_errors(best)?;
+        let wrong = self.deciding_errors(best.elsewhere())?;
+        let (Some(before), Some(after), Some(wrong)) = (before, after, wrong) else {
+            return Ok(None);
+        };
         let norm = self.norm();
         let is_explained = after.iter().sum::<f64>() < EXPLAINED * wrong.iter().sum::<f64>();
         let converged = fit.has_settled && is_explained && self.plan.includes(&best.motion);
