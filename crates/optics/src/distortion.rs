@@ -70,11 +70,14 @@ struct Model {
     spread: f64,
 }
 
+/// Place, displacement and weight of a part of the picture.
+type Part = ([f64; 2], [f64; 2], f64);
+
 impl Model {
     /// Weighted least squares.
-    fn fit(parts: &[([f64; 2], [f64; 2], f64)]) -> Option<Self> {
+    fn fit(parts: &[Part]) -> Option<Self> {
         let total: f64 = parts.iter().map(|(.., weight)| weight).sum();
-        let mean = |value: fn(&([f64; 2], [f64; 2], f64)) -> f64| {
+        let mean = |value: fn(&Part) -> f64| {
             parts.iter().map(|part| part.2 * value(part)).sum::<f64>() / total
         };
         let middle = [mean(|part| part.0[0]), mean(|part| part.0[1])];

@@ -101,6 +101,9 @@ pub(super) fn alteration(observed: &Observed<'_>) -> Option<Alteration> {
     is_mask.then_some(Alteration::MissingMask)
 }
 
+/// A block: mean of the measurement, estimates by both halves of the frames, weight and energy of the masks.
+type Block = (f64, [f64; 2], f64, f64);
+
 /// Slope of the mean of a block against the light that its fine structure predicts. It is 1 with any offset, and below 1
 /// where texture hides the fine structure.
 ///
@@ -136,7 +139,7 @@ fn slope(strips: &[Strip], fit: &Fit, weights: &[Array1<f64>]) -> f64 {
     let median = energies.get(energies.len() / 2).copied().unwrap_or_default();
     blocks.retain(|block| block.3 > 0.2 * median);
     let total: f64 = blocks.iter().map(|block| block.2).sum();
-    let mean = |value: &dyn Fn(&(f64, [f64; 2], f64, f64)) -> f64| {
+    let mean = |value: &dyn Fn(&Block) -> f64| {
         blocks.iter().map(|block| block.2 * value(block)).sum::<f64>() / total
     };
     let (y, one, other) = (mean(&|b| b.0), mean(&|b| b.1[0]), mean(&|b| b.1[1]));

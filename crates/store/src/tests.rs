@@ -91,7 +91,7 @@ impl Lab {
         let worker = WorkerId::new();
         store.worker_started(worker, 1, &WorkerPlace::default(), Claimant::Local).await.unwrap();
         let asked = Submission::Calibration(asked);
-        let passed = Checked::Masks(facts, upload(b"prepared masks"));
+        let passed = Checked::Masks(Box::new(facts), upload(b"prepared masks"));
         let calibration = make(&store, worker, asked, passed).await;
         let facts = NewMeasurement {
             calibration,

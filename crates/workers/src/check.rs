@@ -223,7 +223,7 @@ impl Running<'_> {
             dispersion,
             corrected: None,
         };
-        Ok(Checked::Masks(facts, writer.finish()?.finish()?))
+        Ok(Checked::Masks(Box::new(facts), writer.finish()?.finish()?))
     }
 
     /// Writes masks as the registration of a job has corrected them.
@@ -273,7 +273,7 @@ impl Running<'_> {
                 masks: calibration.inputs(),
             }),
         };
-        Ok(Checked::Masks(facts, masks))
+        Ok(Checked::Masks(Box::new(facts), masks))
     }
 
     /// Subtracts the dark from a measurement, divides by its full scale, and checks it against the masks of its

@@ -4,8 +4,8 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use engine::job::ModelRecord;
 use engine::job::{Algorithm, RunSpec, Schedule, TileSpec};
-use engine::pipeline::networks::ModelRecord;
 use engine::pipeline::records::JointRecord;
 use sci_recon::cli::CliError;
 use serde::{Deserialize, Serialize};

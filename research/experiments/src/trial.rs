@@ -4,7 +4,7 @@ use std::thread;
 use std::time::Instant;
 
 use engine::job::{Algorithm, RunSpec, Sequence};
-use engine::pipeline::networks::{ModelRecord, NetworkSource};
+use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::quality::FrameQuality;
 use engine::pipeline::records::{PilotRecord, TileRecord};
 use engine::pipeline::scale::white;
@@ -171,7 +171,7 @@ impl Bench {
             cut.run = run;
         }
         let deep = learned.is_some() || schedule.needs_network();
-        let mut models = ModelRecord::of(&schedule);
+        let mut models = self.network.records(&schedule);
         models.extend(learned.map(Model::record));
         Ok(Key {
             program_version: env!("CARGO_PKG_VERSION").into(),

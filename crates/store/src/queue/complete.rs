@@ -49,7 +49,7 @@ pub enum Product {
 #[derive(Debug)]
 pub enum Checked {
     /// Masks on \[0,1\].
-    Masks(NewCalibration, StagedBlob),
+    Masks(Box<NewCalibration>, StagedBlob),
     /// Masks can be made from the captures; the planned CPU-seconds.
     Captures(f64),
     Measurement(NewMeasurement, StagedBlob),

@@ -99,7 +99,8 @@ async fn dark_frames_and_maps_are_kept_while_something_was_made_with_them() {
         bad_pixels: Some(map),
         ..CalibrationRequest::default()
     };
-    let passed = Checked::Masks(NewCalibration { masks, ..calibrated }, prepared("masks"));
+    let passed =
+        Checked::Masks(Box::new(NewCalibration { masks, ..calibrated }), prepared("masks"));
     let calibration: CalibrationId = lab.make(Submission::Calibration(asked), passed).await;
     lab.work_off().await;
     let dark_frames = vec![dark];
