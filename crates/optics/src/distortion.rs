@@ -71,13 +71,13 @@ struct Model {
 }
 
 /// Place, displacement and weight of a part of the picture.
-type Part = ([f64; 2], [f64; 2], f64);
+type Moved = ([f64; 2], [f64; 2], f64);
 
 impl Model {
     /// Weighted least squares.
-    fn fit(parts: &[Part]) -> Option<Self> {
+    fn fit(parts: &[Moved]) -> Option<Self> {
         let total: f64 = parts.iter().map(|(.., weight)| weight).sum();
-        let mean = |value: fn(&Part) -> f64| {
+        let mean = |value: fn(&Moved) -> f64| {
             parts.iter().map(|part| part.2 * value(part)).sum::<f64>() / total
         };
         let middle = [mean(|part| part.0[0]), mean(|part| part.0[1])];

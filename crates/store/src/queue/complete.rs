@@ -165,7 +165,7 @@ impl Store {
                 let prepared = staged.sha256();
                 let seconds = planned_seconds(0, facts.frames, facts.height * facts.width);
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                things::record::<CalibrationId>(transaction, id.into(), prepared, &facts).await?;
+                things::record::<CalibrationId>(transaction, id.into(), prepared, &*facts).await?;
                 seconds
             }
             Checked::Captures(seconds) => seconds,
