@@ -111,7 +111,7 @@ impl Lab {
             reading: Reading::whole(ScaleBasis::Type),
         };
         let asked = MeasurementRequest::new(None, calibration, data.sha256);
-        let passed = Checked::Measurement(facts, upload(b"prepared data"));
+        let passed = Checked::Measurement(Box::new(facts), upload(b"prepared data"));
         let measurement = make(&store, worker, Submission::Measurement(asked), passed).await;
         let lab = Self { store, measurement, worker, _folder: folder };
         assert_eq!(lab.work_off().await, [TaskKind::Calibration], "its report");

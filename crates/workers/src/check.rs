@@ -359,7 +359,7 @@ impl Running<'_> {
             warnings,
             reading,
         };
-        Ok(Checked::Measurement(facts, staged))
+        Ok(Checked::Measurement(Box::new(facts), staged))
     }
 
     /// Runs a network once, in a separate process.

@@ -52,7 +52,7 @@ pub enum Checked {
     Masks(Box<NewCalibration>, StagedBlob),
     /// Masks can be made from the captures; the planned CPU-seconds.
     Captures(f64),
-    Measurement(NewMeasurement, StagedBlob),
+    Measurement(Box<NewMeasurement>, StagedBlob),
     Model(NewModel),
     Refused(Refusal),
 }
@@ -172,7 +172,7 @@ impl Store {
             Checked::Measurement(facts, staged) => {
                 let prepared = staged.sha256();
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                return things::record::<MeasurementId>(transaction, id.into(), prepared, &facts)
+                return things::record::<MeasurementId>(transaction, id.into(), prepared, &*facts)
                     .await;
             }
             Checked::Model(facts) => {

@@ -109,7 +109,7 @@ async fn dark_frames_and_maps_are_kept_while_something_was_made_with_them() {
         ..MeasurementRequest::new(None, calibration, data)
     };
     let facts = NewMeasurement { calibration, data, dark: dark_frames, ..measured };
-    let passed = Checked::Measurement(facts, prepared("snapshots"));
+    let passed = Checked::Measurement(Box::new(facts), prepared("snapshots"));
     let measurement: MeasurementId = lab.make(Submission::Measurement(asked), passed).await;
     let soon = Timestamp(Timestamp::now().0 + 1000);
     assert_eq!(lab.store.collect(soon).await.unwrap(), []);

@@ -73,7 +73,7 @@ impl Lab {
                 Work::Check(ref check)
                     if matches!(check.request.submission, Submission::Measurement(_)) =>
                 {
-                    let passed = Checked::Measurement(facts, prepared);
+                    let passed = Checked::Measurement(Box::new(facts), prepared);
                     super::checked(&self.store, &task, passed).await;
                 }
                 _ => self.end(&task, 5).await,
