@@ -93,7 +93,7 @@ pub struct Arguments {
     #[arg(long, value_name = "ORDER", value_parser = named::<Axes>())]
     truth_axes: Option<Axes>,
     /// Masks that have moved since the calibration: off, auto to estimate and correct the motion, or
-    /// ROWS,COLUMNS[,DEGREES[,SCALE]] to state the shift in pixels, a clockwise rotation and a factor.
+    /// ROWS,COLUMNS or ROWS,COLUMNS,DEGREES,SCALE to state a shift in pixels, a clockwise rotation and a factor.
     #[arg(long, value_name = "WHICH", default_value = "auto", value_parser = registration, allow_hyphen_values = true)]
     registration: RegistrationRequest,
     #[command(flatten)]

@@ -84,7 +84,7 @@ pub(super) struct SubmissionArguments {
     #[arg(long, value_name = "PIXELS", requires = "tile", help_heading = JOB)]
     overlap: Option<u32>,
     /// Masks that have moved since the calibration: off, auto to estimate and correct the motion, or
-    /// ROWS,COLUMNS[,DEGREES[,SCALE]] to state the shift in pixels, a clockwise rotation and a factor [default: auto].
+    /// ROWS,COLUMNS or ROWS,COLUMNS,DEGREES,SCALE to state a shift in pixels, a clockwise rotation and a factor [default: auto].
     #[arg(long, value_name = "WHICH", value_parser = registration, allow_hyphen_values = true, help_heading = JOB)]
     registration: Option<RegistrationRequest>,
     /// True frames [frame, row, column] of this snapshot, or of all. PSNR and SSIM are relative to them.
