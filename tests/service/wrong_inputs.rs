@@ -254,18 +254,6 @@ async fn a_missing_mask_is_named_before_the_dark() {
     assert_eq!(measurement["warnings"][0]["code"], "missing_mask", "{measurement:#}");
 }
 
-#[test]
-fn shuffled_masks_that_resemble_one_another_are_found_by_the_motion() {
-    let masks = grey_masks();
-    let y = snapshot(&masks);
-    let order = [3, 1, 6, 0, 7, 2, 5, 4];
-    let shuffled: Vec<f32> =
-        order.iter().flat_map(|k| masks[k * PIXELS..(k + 1) * PIXELS].to_vec()).collect();
-    let (assessment, codes) = reconstruct(&shuffled, &y);
-    assert_eq!(codes, ["exchanged_masks"]);
-    assert_eq!((&assessment["order"], &assessment["psnr_db"]), (&"doubtful".into(), &Value::Null));
-}
-
 #[tokio::test]
 async fn masks_of_another_size_get_the_likely_cause() {
     let app = TestApp::start().await;

@@ -541,10 +541,8 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
         Some(cause) => findings.push(cause),
         None => {
             let not_shown = dark_frames(figures);
-            match uneven_brightness(figures, &not_shown) {
-                Some(missing) => findings.push(missing),
-                None => findings.extend(missing_patterns(not_shown)),
-            }
+            findings.extend(uneven_brightness(figures, &not_shown));
+            findings.extend(missing_patterns(not_shown));
             findings.extend(unexplained_light(figures, dark_subtracted));
         }
     }
