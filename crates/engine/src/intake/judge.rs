@@ -278,6 +278,9 @@ fn displaced_masks(
     }))
 }
 
+/// Smallest change of the magnification that the search can tell from a shift.
+const SMALLEST_GROWTH: f32 = 0.005;
+
 /// Side of the window in which other magnifications are searched, in pixels.
 const MAGNIFIED_WINDOW: usize = 256;
 
@@ -298,6 +301,8 @@ fn magnified_masks(
     let band = masks.read_window(0..frames, rows, columns)?;
     let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
     let found = magnification(band.sum_axis(Axis(0)).view(), y.view());
+    let found = found.filter(|found| (found.factor - 1.0).abs() > SMALLEST_GROWTH);
+    // A shift alone is found by its own search.
     let Some(Magnified { factor, displacement }) = found else { return Ok(None) };
     // The search compares the sum of the masks; the fit of all frames decides.
     let mut enlarged = Vec::new();
