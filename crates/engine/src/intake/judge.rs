@@ -279,7 +279,7 @@ fn displaced_masks(
 }
 
 /// Smallest change of the magnification that the search can tell from a shift.
-const SMALLEST_GROWTH: f32 = 0.005;
+const SMALLEST_GROWTH: f64 = 0.005;
 
 /// Side of the window in which other magnifications are searched, in pixels.
 const MAGNIFIED_WINDOW: usize = 256;
