@@ -21,13 +21,7 @@ pub fn http_client() -> Result<reqwest::ClientBuilder, String> {
         Some(format!("{variable} names {}, which has no certificate in PEM form", place.display()))
     });
     if let Some(stated) = stated.filter(|_| is_lost || found.certs.is_empty()) {
-        let reasons: Vec<String> = found.errors.iter().map(ToString::to_string).collect();
-        let reasons = if reasons.is_empty() {
-            reasons.concat()
-        } else {
-            format!(" ({})", reasons.join("; "))
-        };
-        return Err(format!("{stated}{reasons}: correct the variable, or unset it"));
+        return Err(format!("{stated}: correct the variable, or unset it"));
     }
     let mut trusted = rustls::RootCertStore::empty();
     trusted.add_parsable_certificates(found.certs);

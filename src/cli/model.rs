@@ -4,8 +4,7 @@ use std::path::Path;
 
 use super::CliError;
 use crate::cli::error::Result;
-use engine::job::ModelRecord;
-use engine::job::{Algorithm, Cut, CutRequest, Schedule, Sequence, TileSpec};
+use engine::job::{Algorithm, Cut, CutRequest, ModelRecord, Schedule, Sequence, TileSpec};
 use engine::pipeline::networks::{ModelFile, NetworkSource};
 use reconstruction::learned::{Interface, PictureSize};
 

@@ -278,7 +278,7 @@ fn displaced_masks(
     }))
 }
 
-/// Smallest change of the magnification that the search can tell from a shift.
+/// Smallest change of the magnification that is reported. The search for shifts finds smaller ones.
 const SMALLEST_GROWTH: f64 = 0.005;
 
 /// Side of the window in which other magnifications are searched, in pixels.
@@ -302,7 +302,6 @@ fn magnified_masks(
     let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
     let found = magnification(band.sum_axis(Axis(0)).view(), y.view());
     let found = found.filter(|found| (found.factor - 1.0).abs() > SMALLEST_GROWTH);
-    // A shift alone is found by its own search.
     let Some(Magnified { factor, displacement }) = found else { return Ok(None) };
     // The search compares the sum of the masks; the fit of all frames decides.
     let mut enlarged = Vec::new();
@@ -314,20 +313,19 @@ fn magnified_masks(
     let Ok(enlarged) = ndarray::stack(Axis(0), &views) else { return Ok(None) };
     let y = central(y.view(), size);
     let explained = explained_after(enlarged.view(), y, &displacement);
-    Ok(Some({
-        let change = match factor > 1.0 {
-            true => format!("enlarged by a factor of about {factor:.2}"),
-            false => format!("reduced by a factor of about {:.2}", factor.recip()),
-        };
-        let detail = format!(
-            "the masks explain {:.0} % of the fine structure of the measurement when {change}, but only {:.1} % in \
-             their size. Most likely masks or measurement were resized or binned after their recording: compare the sizes of \
-             the raw files. Otherwise the lens was changed since the calibration",
-            100.0 * explained,
-            100.0 * given.explained_unshifted
-        );
-        Misplaced { explained, finding: optics::Finding::new(FindingCode::ResampledMasks, detail) }
-    }))
+    let change = match factor > 1.0 {
+        true => format!("enlarged by a factor of about {factor:.2}"),
+        false => format!("reduced by a factor of about {:.2}", factor.recip()),
+    };
+    let detail = format!(
+        "the masks explain {:.0} % of the fine structure of the measurement when {change}, but only {:.1} % in \
+         their size. Most likely masks or measurement were resized or binned after their recording: compare the sizes of \
+         the raw files. Otherwise the lens was changed since the calibration",
+        100.0 * explained,
+        100.0 * given.explained_unshifted
+    );
+    let finding = optics::Finding::new(FindingCode::ResampledMasks, detail);
+    Ok(Some(Misplaced { explained, finding }))
 }
 
 /// Looks for an orientation of the masks that explains a snapshot, which the given one does not.

@@ -385,12 +385,9 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
 
 #[cfg(test)]
 use crate::job::{CalibrationRequest, MeasurementRequest};
-#[cfg(test)]
-use reconstruction::priors::onnx::Device;
 
 #[cfg(test)]
 pub(super) fn sample(frames: usize) -> Manifest {
-    let source = super::networks::NetworkSource::new(None, Device::Cpu);
     let hash = Sha256::of(b"");
     let recipe = Recipe {
         program_version: VERSION,
@@ -404,7 +401,7 @@ pub(super) fn sample(frames: usize) -> Manifest {
             measurement: MeasurementRequest::new(None, CalibrationId::new(), hash)
                 .inputs(Some("frame-row-column".to_owned())),
         },
-        models: source.records(&Algorithm::PnpTvFastdvdnet.default_schedule()),
+        models: vec![ModelRecord { name: "fastdvdnet-gray-int8".into(), sha256: hash.to_string() }],
         scale: ScaleRecord {
             masks_full_scale: 1.0,
             measurement_full_scale: 255.0,

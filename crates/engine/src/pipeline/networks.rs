@@ -178,6 +178,8 @@ pub struct NetworkSource {
     library: Option<PathBuf>,
     /// Networks that replace the embedded ones: the contents of their files, in order.
     replaced: Arc<Vec<(Network, Vec<Vec<u8>>)>>,
+    /// The records of [`Network::ALL`]: each is hashed once, as every tile and every submission asks for them.
+    records: Arc<[OnceLock<ModelRecord>; Network::ALL.len()]>,
     device: Device,
     version: Arc<OnceLock<String>>,
     #[cfg(feature = "gpu")]
@@ -190,6 +192,7 @@ impl NetworkSource {
         Self {
             library,
             replaced: Arc::default(),
+            records: Arc::default(),
             device,
             version: Arc::default(),
             #[cfg(feature = "gpu")]
@@ -217,7 +220,7 @@ impl NetworkSource {
         if replaced.is_empty() {
             return Err(NetworkError::NoModels(folder.to_owned()));
         }
-        Ok(Self { replaced: replaced.into(), ..self })
+        Ok(Self { replaced: replaced.into(), records: Arc::default(), ..self })
     }
 
     /// True if a folder's network replaces one of the schedule.
@@ -232,8 +235,15 @@ impl NetworkSource {
 
     /// The record of a network.
     pub fn record(&self, network: Network) -> ModelRecord {
-        let contents = self.contents(network);
-        ModelRecord::new(&carried(network), contents.iter().map(AsRef::as_ref))
+        let new = || {
+            let model = carried(network);
+            match self.replacement(network) {
+                Some(files) => ModelRecord::new(&model, files.iter().map(Vec::as_slice)),
+                None => ModelRecord::new(&model, model.files.iter().map(|(_, file)| *file)),
+            }
+        };
+        let kept = Network::ALL.iter().zip(&*self.records).find(|(which, _)| **which == network);
+        kept.map_or_else(new, |(_, record)| record.get_or_init(new).clone())
     }
 
     /// The records of the networks that a schedule uses, in a fixed order.

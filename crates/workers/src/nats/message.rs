@@ -4,8 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::transport::TileTask;
-use engine::job::ModelRecord;
-use engine::job::{JobId, Sha256, TaskId, TaskProgress, WorkerId};
+use engine::job::{JobId, ModelRecord, Sha256, TaskId, TaskProgress, WorkerId};
 use engine::pipeline::networks::NetworkSource;
 use reconstruction::priors::Network;
 
