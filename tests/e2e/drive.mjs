@@ -267,6 +267,22 @@ export async function bands(page, checks, service, scene, count) {
   await checks.look(page, "compare-bands");
 }
 
+/** Opens the page of a job that ends between the first answer of the service and the next: its frames appear. */
+export async function ending(browser, checks, service, id) {
+  const page = await checks.page(await browser.newContext({ viewport: { width: 1400, height: 900 } }));
+  const ended = await service.call("GET", `/v1/jobs/${id}`);
+  const progress = { ...ended.progress, percent: 0, stage: "waiting", previews_done: 0, tiles_done: 0, snapshots_done: 0 };
+  const running = { ...ended, state: "running", finished_at: null, assessment: null, progress };
+  const missing = { status: 404, contentType: "application/problem+json", json: { status: 404, code: "not_ready", title: "Not ready yet" } };
+  await page.route(`**/v1/jobs/${id}`, (route) => route.fulfill({ json: running }), { times: 1 });
+  await page.route(`**/view/jobs/${id}/snapshots/*/pictures/*/spread`, (route) => route.fulfill(missing), { times: 1 });
+  await page.goto(`${service.url}/#/jobs/${id}`);
+  await state(page, "succeeded");
+  await page.waitForSelector("[aria-label=Frames] .player output");
+  checks.that(await page.isHidden("[aria-label=Frames] .sight .note"), "no note says that there are no frames yet");
+  await page.context().close();
+}
+
 /** Shows the displacement that a job has found. */
 export async function moved(page, checks) {
   await page.waitForSelector(".quality:has-text('Expected PSNR: about')");

@@ -8,7 +8,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, bands, captures, colour, compare, decided, judged, manage, mended, moved, movie, network, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, bands, captures, colour, compare, decided, ending, judged, manage, mended, moved, movie, network, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene, spectral } from "./scene.mjs";
@@ -67,6 +67,7 @@ async function everything() {
   await service.when(registered.id, (job) => job.state === "succeeded");
   await page.goto(`${service.url}/#/jobs/${registered.id}`);
   await checks.step("moved", () => moved(page, checks));
+  await checks.step("ending", () => ending(browser, checks, service, registered.id));
   const known = await checks.step("stated", () => stated(page, checks, drifting, small));
   const { registration } = await service.call("GET", `/v1/jobs/${known}`);
   checks.that(JSON.stringify(registration) === '{"shift":[2,-1],"rotation":0,"scale":1}', `the job has the stated shift: ${JSON.stringify(registration)}`);

@@ -36,7 +36,6 @@ export async function job(root, [id], signal) {
   camera(found, viewer, signal);
 
   let shown = null;
-  let ready = null;
   const leave = () => (location.hash = "#/jobs");
   const call = (name) => {
     put(title, name);
@@ -67,10 +66,10 @@ export async function job(root, [id], signal) {
       put(moved, card);
     }
     await tiles.renew(snapshot.value());
-    const done = `${now.progress.previews_done} ${now.progress.tiles_done} ${now.progress.snapshots_done} ${now.state}`;
-    if (shown && done !== ready) await viewer.renew();
-    if (done !== ready) await results(now);
-    ready = done;
+    // The job may have ended between the first answer, for which the viewer was opened, and the next one.
+    const drawn = shown ?? found;
+    if (extentOf(now) !== extentOf(drawn)) await viewer.renew();
+    if (!shown || extentOf(now) !== extentOf(shown)) await results(now);
     shown = now;
   };
   const results = async (now) => {
@@ -91,6 +90,9 @@ export async function job(root, [id], signal) {
   await viewer.open(snapshot.value());
   watch(refresh, signal);
 }
+
+/** How much of a job is computed: its pictures and files change with this text. */
+const extentOf = ({ state, progress }) => [state, progress.previews_done, progress.tiles_done, progress.snapshots_done].join(" ");
 
 /** Sets the full scale, and the true frame rate if the camera's times are known. */
 async function camera(found, viewer, signal) {
