@@ -166,12 +166,13 @@ findings! {
         "state the `full_scale` of the measurement for its exposure and bit depth";
     NoDark: [Measurement], [Warning, Error],
         "3 % or more of the light is not explained by the masks, and no dark frames were named",
-        "record dark frames (scene_black) with the LCoS all black, at the measurement's exposure and gain, and name \
-         them as `dark`";
+        "record dark frames: close every pixel of the coded aperture (LCoS all black, DMD all off; cap the lens only if \
+         the mask can't be closed), at the measurement's exposure, gain and room light, and name them as `dark`";
     WrongDark: [Calibration, Measurement], [Warning, Error],
         "the dark frames do not belong to these captures",
-        "record the dark frames (`black` and `black_with_mask`, or the measurement's `dark`) again with the LCoS all \
-         black, at the exposure, gain and room light of the captures they are subtracted from";
+        "record the dark frames (`black` and `black_with_mask`, or the measurement's `dark`) again with every pixel of \
+         the coded aperture closed (LCoS all black), at the exposure, gain and room light of the captures they are \
+         subtracted from";
     Negative: [Measurement], [Warning, Error],
         "parts of the image are below 0 by more than noise",
         "record the dark frames again at the measurement's exposure; if dark frames were subtracted before the \
@@ -192,7 +193,8 @@ findings! {
          finding stays, record dark frames and name them as `dark`";
     MovedMasks: [Job], [Warning],
         "the job uses masks that are displaced from their calibrated position",
-        "calibrate again once the optics are stable";
+        "if another finding questions the dark or the full scale, correct that first, because it can look like a motion; \
+         otherwise calibrate again once the optics are stable";
     MisplacedMasks: [Job], [Error],
         "the moved masks explain less than before, or a large part of the light not at all",
         "check the shift stated as `registration`: pixels down, then pixels to the right; or estimate it with `registration` auto";

@@ -273,7 +273,7 @@ function measurementStep(form, changed, signal) {
     input.addEventListener("change", () => last && make(last, known).catch((error) => put(verdict, problem(error))));
   }
   const drop = dropZone("data", "Measurement", `one or more snapshots: ${HINT}`, signal, (blob) => make(blob.sha256));
-  const dark = dropZone("darks", "Dark captures", "Optional: recorded while the modulator is black, at the same exposure", signal, async (blob, file) => {
+  const dark = dropZone("darks", "Dark captures", "Optional: every pixel of the coded aperture closed (LCoS all black), at the same exposure", signal, async (blob, file) => {
     setDarks([...darks, { sha256: blob.sha256, name: file.name }]);
   }, true);
   const inside = h("div", { hidden: true },

@@ -207,8 +207,8 @@ impl Registered {
         let errors = self.error_before.zip(self.error_after);
         let detail = match errors.filter(|_| self.uncertainty.is_some()) {
             Some((before, after)) => format!(
-                "the masks have moved by {} since the calibration; the job has corrected them, which lowers the hold-out \
-                 error from {:.2} to {:.2} %",
+                "the job uses masks that are displaced by {}, which lowers the error at hold-out pixels from {:.2} to \
+                 {:.2} % of the brightness",
                 described(motion, true),
                 100.0 * before.sqrt(),
                 100.0 * after.sqrt()

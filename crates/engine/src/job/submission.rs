@@ -85,7 +85,7 @@ pub struct MeasurementRequest {
     /// How the pixels of data and dark frames are packed; by default one number per pixel.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub packing: Option<Packing>,
-    /// Captures with the LCoS all black, at the measurement's exposure. The average of the captures is subtracted.
+    /// Captures with the coded aperture closed (LCoS all black), at the measurement's exposure. Their average is subtracted.
     #[serde(default)]
     #[schemars(length(max = 2048))]
     pub dark: Vec<Sha256>,
