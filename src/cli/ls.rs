@@ -40,7 +40,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         }
         for job in jobs {
             let job = Job::new(job)?;
-            let Job { id, state, created_at, algorithm, .. } = &job;
+            let Job { id, created_at, algorithm, .. } = &job;
+            let state = verdict::state_word(job.state);
             let percent = job.progress.percent;
             let verdict = job.verdict().unwrap_or_default();
             let label = job.label.as_deref().unwrap_or_default();

@@ -699,6 +699,12 @@ impl Report {
                 changes(decided)
             ))?;
         }
+        if let Some(ratio) = self.pilot.as_ref().and_then(PilotRecord::hold_out_ratio) {
+            print_line(format!(
+                "error at held-out pixels: {ratio:.2} times that of a guess from their neighbours (right masks usually have \
+                 up to 0.5; from 1 on the masks explain nothing)"
+            ))?;
+        }
         for joint in self.pilot.iter().flat_map(|pilot| &pilot.joints) {
             let error =
                 |error: Option<f64>| error.map_or("none".into(), |error| format!("{error:.4}"));

@@ -54,7 +54,8 @@ fn line(finding: &Finding, snapshots: &[u32]) -> String {
 /// The grade, with the expected PSNR if it can be predicted, and whether the order of the masks was verified.
 pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> String {
     match assessment {
-        Some(Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, order, .. }) => {
+        Some(assessment) => {
+            let Assessment { grade, psnr_db, psnr_low_db, psnr_high_db, order, .. } = assessment;
             let grade = grade.into_str();
             let best = Assessment::MAX_PSNR_DB;
             let mut text = match (psnr_db, psnr_low_db, psnr_high_db) {
@@ -67,6 +68,9 @@ pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> 
                 (Some(_), ..) => format!("{grade}, expected PSNR {best:.0} dB or more"),
                 (None, ..) => format!("{grade}, no expected PSNR"),
             };
+            if let Some(threshold) = missed(assessment) {
+                text += &format!("; {threshold}");
+            }
             if *order == Some(MaskOrder::NotVerifiable) {
                 text += "; order of masks not verifiable: the scene moves too little or too fast";
             }
@@ -74,6 +78,29 @@ pub(super) fn verdict(assessment: Option<&Assessment>, findings: &[Finding]) -> 
         }
         None if !errors(findings).is_empty() => "bad".to_owned(),
         None => "not assessed".to_owned(),
+    }
+}
+
+/// The threshold of the next better grade, if the expected PSNR has missed it.
+fn missed(assessment: &Assessment) -> Option<String> {
+    let Assessment { grade, psnr_db, psnr_high_db, .. } = assessment;
+    let (good, usable) = (Assessment::GOOD_DB, Assessment::BAD_DB);
+    match grade {
+        Grade::Usable if psnr_db.is_some_and(|psnr| psnr < good) => {
+            Some(format!("good from {good:.0} dB"))
+        }
+        Grade::Bad if psnr_high_db.is_some_and(|high| high < usable) => {
+            Some(format!("usable if the interval reaches {usable:.0} dB"))
+        }
+        _ => None,
+    }
+}
+
+/// The word for a state. Only the verdict says whether the frames are good, so `succeeded` reads "finished".
+pub(super) fn state_word(state: JobState) -> &'static str {
+    match state {
+        JobState::Succeeded => "finished",
+        other => other.into_str(),
     }
 }
 
@@ -127,12 +154,12 @@ impl Job {
         (self.state == JobState::Succeeded).then(verdict)
     }
 
-    /// Identifier, state and verdict, and an indented line for each finding.
+    /// Identifier, verdict and state, and an indented line for each finding.
     pub(super) fn summary(&self) -> String {
-        let verdict = self.verdict().map(|verdict| format!(": {verdict}")).unwrap_or_default();
+        let verdict = self.verdict().map(|verdict| format!("{verdict}; ")).unwrap_or_default();
         let findings = lines(&self.findings());
         let findings = findings.iter().map(|line| format!("\n    {line}")).collect::<String>();
-        format!("{} {}{verdict}{findings}", self.id, self.state)
+        format!("{}: {verdict}{}{findings}", self.id, state_word(self.state))
     }
 }
 
@@ -202,6 +229,17 @@ mod tests {
         let withheld = Assessment { psnr_db: None, ..assessment };
         assert_eq!(verdict(Some(&withheld), &[]), "usable, no expected PSNR");
         assert_eq!(verdict(None, &[]), "not assessed");
+        let graded = |grade, psnr, high| Assessment {
+            grade,
+            psnr_db: Some(psnr),
+            psnr_low_db: Some(psnr - 3.0),
+            psnr_high_db: Some(high),
+            ..withheld.clone()
+        };
+        let text = verdict(Some(&graded(Grade::Usable, 24.1, 26.0)), &[]);
+        assert_eq!(text, "usable, expected PSNR 24.1 dB (21.1 to 26.0); good from 28 dB");
+        let text = verdict(Some(&graded(Grade::Bad, 18.0, 20.0)), &[]);
+        assert!(text.ends_with("; usable if the interval reaches 22 dB"), "{text}");
         assert_eq!(verdict(None, &[finding("a", Severity::Error, None)]), "bad");
     }
 }

@@ -83,7 +83,8 @@ async fn a_lab_machine_submits_watches_and_downloads_over_cut_connections() {
     assert_eq!(calibrations["items"].as_array().unwrap().len(), 1);
 
     let watched = lab.text(&["watch", &job]).await;
-    assert!(watched.starts_with(&format!("{job} succeeded: ")), "{watched}");
+    let line = watched.lines().next().unwrap_or_default();
+    assert!(line.starts_with(&format!("{job}: ")) && line.ends_with("; finished"), "{watched}");
     let everything = [
         "frames.npy,stack.exr,stack-sigma.exr,stack.tif,movie.mp4,movie.gif,frames,png,manifest.json",
         "sequence.npy,sequence.mp4,sequence.gif",
@@ -401,7 +402,7 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     let watched = lab.run(&["watch", &job]).await;
     let text = String::from_utf8(watched.stdout).unwrap();
     assert_eq!(watched.status.code(), Some(3), "{text}");
-    assert!(text.starts_with(&format!("{job} succeeded: bad")), "{text}");
+    assert!(text.starts_with(&format!("{job}: bad")), "the verdict leads: {text}");
     assert!(text.lines().skip(1).any(|line| line.starts_with("    error ")), "{text}");
     let fetched = lab.run(&["fetch", &job, "--out", "out", "--file", "frames.npy"]).await;
     assert_eq!(fetched.status.code(), Some(3));
@@ -409,6 +410,7 @@ async fn findings_are_printed_by_every_command_with_their_remedies() {
     assert!(lab.path("out/snapshot_0000/frames.npy").exists());
     let listed = lab.text(&["ls"]).await;
     assert!(listed.contains("  bad") && listed.contains("\n    error "), "{listed}");
+    assert!(listed.contains("  finished") && !listed.contains("succeeded"), "{listed}");
 
     std::fs::create_dir(lab.path("bench")).unwrap();
     lab.write("bench/oops.npy", &SCENE.masks());

@@ -29,6 +29,8 @@ from ._transfer import Source
 Record = dict[str, Any]
 Snapshots = Literal["all"] | int | tuple[int, int]
 ENDED = {"succeeded", "failed", "cancelled"}
+# Expected PSNR in dB from which frames are good, and the upper end of the interval below which they are bad, as in the service.
+GOOD_DB, BAD_DB = 28, 22
 # Side of the blocks of error.npy in pixels.
 BLOCK = 16
 # Files that the service composes on demand, and their exports.
@@ -524,6 +526,10 @@ class Job(Entity):
                 text = f"{grade}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
             else:
                 text = f"{grade}, expected PSNR 40 dB or more" + (f" ({low:.1f} or more)" if low < 40 else "")
+            if grade == "usable" and psnr is not None and psnr < GOOD_DB:
+                text += f"; good from {GOOD_DB} dB"
+            if grade == "bad" and high is not None and high < BAD_DB:
+                text += f"; usable if the interval reaches {BAD_DB} dB"
             if assessment.get("order") == "not_verifiable":
                 text += "; order of masks not verifiable: the scene moves too little or too fast"
             return text
@@ -663,7 +669,8 @@ class Result:
 
     def expected_error(self, index: int) -> npt.NDArray[np.float32]:
         """The expected error of the frames of a snapshot, [B, H, W]: the root mean square error of each block of 16x16 pixels,
-        on the scale of the frames. Raises `KeyError` if no prediction is possible (`assessment` is None)."""
+        on the scale of the frames. Raises `KeyError` if no prediction is possible (`assessment` is None). While the findings
+        withhold the expected PSNR, the map has no meaning either."""
         blocks: npt.NDArray[np.float32] = np.load(self.download("error.npy", index))
         height, width = self.snapshot(index).shape[1:3]
         return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width]

@@ -38,6 +38,10 @@ pub enum MaskOrder {
 impl Assessment {
     /// Largest reported PSNR in dB. Differences above it are not visible.
     pub const MAX_PSNR_DB: f64 = 40.0;
+    /// Expected PSNR in dB from which frames are graded good.
+    pub const GOOD_DB: f64 = 28.0;
+    /// Frames are graded bad if the upper end of the interval is below this PSNR in dB.
+    pub const BAD_DB: f64 = 22.0;
 
     /// The assessment of a job: the means over its snapshots, and the worst grade. `None` if a snapshot has none. A PSNR is
     /// `None` if that of a snapshot is.

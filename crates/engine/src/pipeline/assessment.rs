@@ -119,11 +119,6 @@ pub struct Expected {
     pub error: Array3<f32>,
 }
 
-/// Expected PSNR in dB from which frames are graded good.
-const GOOD_DB: f64 = 28.0;
-/// Frames are graded bad if the upper end of the interval is below this PSNR in dB.
-const BAD_DB: f64 = 22.0;
-
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
 /// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
 /// of the PSNR. With `spectral` frames are bands, which neither move nor have an order in time. `None` if a tile has none, or
@@ -195,7 +190,10 @@ pub fn expected(
     reasons.sort_by_key(|reason| {
         (reason.is(FindingCode::UnevenError), !reason.is(FindingCode::MaskValues))
     });
-    let stated = |decibels| (!is_in_doubt(&reasons)).then(|| Assessment::round(decibels));
+    let withheld = is_in_doubt(&reasons);
+    // This finding states the figures that are withheld.
+    reasons.retain(|reason| !(withheld && reason.is(FindingCode::UnevenError)));
+    let stated = |decibels| (!withheld).then(|| Assessment::round(decibels));
     let assessment = Assessment {
         grade: grade((psnr_db, high), &reasons),
         psnr_db: stated(psnr_db),
@@ -295,11 +293,11 @@ fn unexplained_pixels(predictions: &[Prediction]) -> Option<Finding> {
 }
 
 /// The grade of the expected PSNR, limited by the findings. Frames are graded bad only if the whole interval is below
-/// [`BAD_DB`], so that usable pictures are not discarded.
+/// [`Assessment::BAD_DB`], so that usable pictures are not discarded.
 fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
     let expected = match psnr_db {
-        GOOD_DB.. => Grade::Good,
-        _ if high >= BAD_DB => Grade::Usable,
+        Assessment::GOOD_DB.. => Grade::Good,
+        _ if high >= Assessment::BAD_DB => Grade::Usable,
         _ => Grade::Bad,
     };
     let severities = reasons
@@ -468,6 +466,11 @@ mod tests {
         let unexplained = predicted(2.0);
         assert_eq!((unexplained.grade, unexplained.psnr_db), (Grade::Bad, None));
         assert_eq!(unexplained.reasons[0].code, "unexplained_pixels");
+        let uneven = tiles([15, 35, 35, 35]).into_iter().flatten();
+        let prediction = Some(Prediction { by_frames: 2.0, by_neighbours: 2.0 });
+        let uneven = uneven.map(|tile| Some(TileAssessment { prediction, ..tile })).collect();
+        let codes: Vec<_> = assess(uneven).unwrap().assessment.reasons;
+        assert_eq!(codes.len(), 1, "no finding states a withheld figure: {codes:?}");
         // One moving tile suffices.
         let mut fast = tiles([25; 4]);
         fast[1] = fast[1].clone().map(|tile| TileAssessment { motion: 8.6, ..tile });

@@ -51,6 +51,13 @@ impl PilotRecord {
         if self.stages.is_empty() { schedule.clone() } else { schedule.decided(&self.stages) }
     }
 
+    /// Hold-out error of the decided schedule's frames, relative to that of the mean of the neighbours.
+    pub fn hold_out_ratio(&self) -> Option<f64> {
+        let prediction = self.evidence.as_ref()?.prediction?;
+        let is_known = prediction.by_neighbours > 0.0;
+        is_known.then(|| (prediction.by_frames / prediction.by_neighbours).sqrt())
+    }
+
     /// The snapshots after which the sequence is cut.
     pub fn cuts(&self) -> Vec<usize> {
         let cut = self.joints.iter().filter(|joint| !joint.together);
