@@ -556,8 +556,12 @@ export async function decided(page, checks, decision) {
   const card = await page.waitForSelector("section[aria-label='How it was made']:has-text('Pilot, tv')", { timeout: 30_000 });
   const text = await card.textContent();
   const change = decision.stage.temporal_weight === 0 ? "temporal weight omitted" : "as planned";
-  const expected = `${change}, hold-out error 1 to ${Number(decision.error_after.toPrecision(3))}`;
+  const expected = `${change}, hold-out error 1 before, ${Number(decision.error_after.toPrecision(3))} after`;
   checks.that(decision.planned.temporal_weight > 0 && text.includes(expected), `the card shows the pilot's decisions: ${text}`);
+  const [, ratio] = text.match(/Hidden pixels(\S+) times the error of a guess from their neighbours; right masks usually have up to 0\.5/) ?? [];
+  checks.that(ratio > 0 && ratio < 0.5, `the hold-out error has a reference: ${text}`);
+  checks.that(/Time.* in the queue, then .* until the end/.test(text) && /CPU time.* for the tiles/.test(text), `queue, run and CPU time have one row each: ${text}`);
+  checks.that(/White level\S+ × full scale/.test(text) && !text.includes("solver"), `the white level has a unit: ${text}`);
 }
 
 /** Submits the sample on an empty service, without typing. */

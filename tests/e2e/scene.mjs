@@ -61,6 +61,8 @@ export function scene(frames, height, width, seed = 1, mosaic = false) {
       }
       return npy([1, height, width], moved);
     },
+    /** The snapshot in counts of a camera with this full scale, from which no dark was subtracted. */
+    undarkened: (scale) => npy([1, height, width], measurement.map((value) => scale * (value + 0.1 * frames))),
     /** A map of bad pixels: a column that is dead. */
     dead: () => npy([height, width], Float32Array.from({ length: pixels }, (_, at) => (at % width === 7 ? 1 : 0))),
     /** A MATLAB file (level 5) with masks and snapshot under names of somebody's own. */

@@ -30,6 +30,10 @@ export async function faults(browser, checks, program, services) {
   checks.that((await page.inputValue("#rate")) === "80", "eight frames in 0.1 s are 80 frames per second");
   await page.click("#play");
   await checks.look(page, "warning");
+  checks.that((await page.textContent(".head .badge")) === "finished", "only the verdict judges a job that has ended");
+  checks.that(/alone/.test(await page.textContent(".verdictcard > p:last-child")), "the check of the calibration alone doesn't contradict the findings");
+  await withheld(page, checks);
+  await doubted(page, checks, service);
   const stages = [{ prior: "tv", iterations: 10000, tv_weight: 0.05, tv_updates: 40, tolerance: 0 }];
   const long = await service.submit({ measurement: measurement.id, algorithm: "gap-tv", label: "stopped early", schedule: { stages } });
   await service.when(long.id, (job) => job.progress.tiles_running > 0 && job.progress.previews_done > 0);
@@ -65,6 +69,32 @@ export async function faults(browser, checks, program, services) {
   await page.click("#nav >> text=Calibrations");
   await page.waitForSelector("h1:has-text('The service does not answer')");
   await checks.look(page, "offline-view");
+}
+
+/** No map of the expected error is offered while the findings withhold the expected PSNR. */
+async function withheld(page, checks) {
+  await page.waitForSelector(".verdictcard:has-text('No expected PSNR')");
+  await page.waitForSelector(".downloads a >> text=Manifest");
+  checks.that(!/expected error/i.test(await page.textContent(".downloads")), "the map of the expected error is not offered for download");
+  checks.that(await page.$eval("#mode option[value=error]", (option) => option.disabled), "the viewer doesn't offer it");
+}
+
+/** A measurement in counts without dark frames: the missing dark comes first, and nothing says that the masks have moved. */
+async function doubted(page, checks, service) {
+  const seen = scene(8, 128, 160, 5);
+  const { calibration } = await service.take(seen);
+  const data = await service.call("POST", "/v1/blobs", seen.undarkened(1000));
+  const measurement = await service.call("POST", "/v1/measurements", { calibration, data: data.sha256, full_scale: 1000 });
+  checks.that(measurement.warnings.some(({ code }) => code === "no_dark"), `the dark is missing: ${JSON.stringify(measurement.warnings)}`);
+  const job = await service.submit({ measurement: measurement.id, algorithm: "gap-tv3d", label: "no dark" });
+  await service.when(job.id, ({ state }) => state === "succeeded");
+  await page.goto(`${service.url}/#/jobs/${job.id}`);
+  const card = await (await page.waitForSelector("section[aria-label=Registration]:has-text('Not known')")).textContent();
+  checks.that(card.includes("While the finding no_dark stands") && !/masks have moved|they fit/.test(card), `an uncertain registration is no statement: ${card}`);
+  const made = await (await page.waitForSelector("section[aria-label='How it was made']:has-text('Full scale')")).textContent();
+  checks.that(/Full scale1000 counts: /.test(made) && /White level[\d.]+ counts \([\d.]+ × full scale\)/.test(made), `each number has its unit: ${made}`);
+  checks.that(/coded aperture/.test(await page.textContent(".verdictcard .findings")), "the remedy says how to record the dark");
+  await checks.look(page, "no-dark");
 }
 
 /** Sign-in, a wrong token, a forbidden view, another lab, and sign-out. */

@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { View } from "./view.js";
 import { announce, explained, h, put, say } from "./dom.js";
-import { bytes, decibels, duration, expectedRange, figure, frameName, iterationsOf, nameOf, shapeOf, wavelengthsOf } from "./format.js";
+import { bytes, decibels, duration, expectedRange, figure, frameName, iterationsOf, nameOf, shapeOf, stateWord, wavelengthsOf } from "./format.js";
 import { isAborted, get, send, upload } from "./api.js";
 import { networks, ran } from "./provenance.js";
 import { sampled } from "./values.js";
@@ -252,14 +252,14 @@ function figures(jobs, manifests, measured) {
   const rows = [
     measured ? ["PSNR", (_, index) => decibels(measured[index].psnr), "quality"] : ["Expected PSNR", (job) => expectedRange(job.assessment)],
     measured && ["SSIM", (_, index) => figure(measured[index].ssim, 4), "quality"],
-    ["State", (job) => job.state],
+    ["State", (job) => stateWord(job.state)],
     jobs.some((job) => job.dispersion) && ["Bands", wavelengthsOf],
     ["Algorithm", (job) => job.algorithm],
     ["Planned iterations per tile", (job) => (job.schedule.stages.length ? `at most ${iterationsOf(job.schedule)}` : "–")],
     ["Schedule", (job) => job.schedule.stages.map((stage) => `${stage.iterations} × ${stage.prior}`).join(", then ") || "–"],
     ["Done", (job, index) => (manifests[index] ? ran(job, manifests[index].content) : "–")],
     ["Network", (_, index) => (manifests[index] ? networks(manifests[index].content) : "–")],
-    ["CPU time", (_, index) => (manifests[index] ? duration(manifests[index].run.cpu_seconds) : "–")],
+    ["CPU time of the tiles", (_, index) => (manifests[index] ? duration(manifests[index].run.cpu_seconds) : "–")],
     ["Tiles", (job) => `${job.tile.size} pixels, ${job.tile.overlap} shared`],
     ["Measurement", (job) => job.measurement],
     ["Calibration", (job) => job.calibration],

@@ -11,7 +11,7 @@ const LINES = [["residual", 1, "residual ‖y − Hx‖ / ‖y‖"], ["change", 
 /** Draws `points` ([iteration, residual, change, sigma], ...) into an element. */
 export function convergence(element, points) {
   if (points.length === 0) {
-    put(element, h("p", { class: "muted" }, "No iterations yet."));
+    put(element, h("p", { class: "muted" }, "No iterations."));
     return;
   }
   const width = Math.min(MOST_WIDTH, Math.max(LEAST_WIDTH, element.clientWidth));

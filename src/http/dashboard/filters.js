@@ -2,9 +2,10 @@
 
 import { calmly, h, put } from "./dom.js";
 import { recall, remember } from "./storage.js";
+import { stateWord } from "./format.js";
 
 const STATES = ["queued", "running", "succeeded", "failed", "cancelling", "cancelled"];
-const CHOICES = [["", "All states"], ["queued,running", "Active"], ...STATES.map((state) => [state, state[0].toUpperCase() + state.slice(1)])];
+const CHOICES = [["", "All states"], ["queued,running", "Active"], ...STATES.map((state) => [state, stateWord(state)[0].toUpperCase() + stateWord(state).slice(1)])];
 
 /** The filter's fields; `changed()` is called when the filter changes. */
 export function filters(query, changed) {

@@ -104,6 +104,18 @@ export function shapeOf(job, all = true) {
   return `${frames} × ${height} × ${width}${mosaic ? " in colour" : job.dispersion ? ", bands" : ""}${all && count > 1 ? `, ${count} snapshots` : ""}`;
 }
 
+/** A job's state in a word. Only the verdict says whether the frames are good, so `succeeded` reads "finished". */
+export const stateWord = (state) => (state === "succeeded" ? "finished" : state);
+
+/** Factor and words of the unit of pixel values: the camera's counts, or multiples of a full scale of 1. */
+export const unitOf = (fullScale) => ({ factor: fullScale, words: fullScale === 1 ? "× full scale" : "counts" });
+
+/** A pixel value in the camera's counts, and as a multiple of the full scale. */
+export function inUnits(value, fullScale) {
+  const share = `${figure(value)} × full scale`;
+  return fullScale === 1 ? share : `${figure(value * fullScale)} counts (${share})`;
+}
+
 /** Current stage of a job. */
 export function stageOf(job) {
   const words = {
@@ -133,7 +145,7 @@ export function remaining(job) {
   if (job.state === "cancelling") return "stopping";
   if (!job.started_at || !job.finished_at) return "";
   const seconds = (new Date(job.finished_at) - new Date(job.started_at)) / 1000;
-  return `${job.state === "succeeded" ? "took" : "after"} ${duration(seconds)}`;
+  return `${job.state === "succeeded" ? "took" : "ended after"} ${duration(seconds)}`;
 }
 
 /** Maximum number of iterations of a schedule on one tile. */
@@ -141,16 +153,33 @@ export function iterationsOf(schedule) {
   return schedule.stages.reduce((sum, stage) => sum + stage.iterations, 0);
 }
 
+/** The findings of the checks of a job, and those reasons of its assessment that have other codes. */
+export function findingsOf({ warnings }, assessment) {
+  const codes = new Set(warnings.map(({ code }) => code));
+  return [...warnings, ...(assessment?.reasons ?? []).filter(({ code }) => !codes.has(code))];
+}
+
 /**
  * The verdict on a job's frames, as kind, word, title and reason: its findings limit the grade of its expected PSNR. The
  * list shows the word, the job's page the title and the reason.
  */
 export function verdictOf(job, assessment = job.assessment) {
-  if (job.warnings.some((item) => item.severity === "error")) return ["bad", "bad", "Bad", "The checks found errors that make the frames wrong:"];
+  if (findingsOf(job, assessment).some((item) => item.severity === "error")) return ["bad", "bad", "Bad", "The checks found errors that make the frames wrong:"];
   if (job.warnings.length > 0) return ["usable", "doubtful", "Doubtful", "The checks found problems that may degrade the frames:"];
   if (assessment?.psnr_db === null) return ["usable", "doubtful", "Doubtful", "The quality of these frames can’t be predicted:"];
-  if (assessment) return [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `Measurement and calibration fit each other. ${LIKE[assessment.grade]}`];
+  if (assessment) return [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `${limitOf(assessment)} ${LIKE[assessment.grade]}`];
   return ["unknown", "not judged", "Not judged", "Measurement and calibration fit each other. No quality can be predicted for this algorithm or sensor. Attach true frames, if you have them, to measure it."];
+}
+
+/** Expected PSNR in dB from which frames are good, and the upper end of the interval below which they are bad, as in the service. */
+const [GOOD_DB, BAD_DB] = [28, 22];
+
+/** What decided the grade of an assessment: a figure and its threshold, a finding, or one of several snapshots. */
+function limitOf({ grade, psnr_db: psnr, psnr_high_db: high, reasons }) {
+  if (grade === "good") return `The expected PSNR has reached ${GOOD_DB} dB, the threshold for “good”.`;
+  if (grade === "bad" && high < BAD_DB) return `The whole interval of the expected PSNR is below ${BAD_DB} dB, the threshold for “usable”.`;
+  if (grade === "usable" && psnr < GOOD_DB) return `The expected PSNR is below ${GOOD_DB} dB, the threshold for “good”.`;
+  return reasons.some(({ code }) => code !== "uneven_error") ? "The finding below limits the verdict." : "The verdict is that of the worst snapshot.";
 }
 
 /** Verdicts on a measured PSNR: kind, word, title, reason, and the lower limit in dB, in descending order. */
@@ -179,10 +208,11 @@ const LIKE = {
 
 /** Number and highest severity of a job's findings; null if there are none. */
 export function doubts(job) {
+  const found = findingsOf(job, job.assessment);
   // A finding counts once, even if several snapshots have it.
-  const distinct = (severity) => new Set(job.warnings.filter((item) => item.severity === severity).map((item) => item.code)).size;
+  const distinct = (severity) => new Set(found.filter((item) => item.severity === severity).map((item) => item.code)).size;
   const [errors, warnings] = [distinct("error"), distinct("warning")];
   const count = (number, word) => number > 0 && `${number} ${word}${number > 1 ? "s" : ""}`;
-  if (job.warnings.length === 0) return null;
-  return { severity: errors > 0 ? "error" : "warning", text: [count(errors, "error"), count(warnings, "warning")].filter(Boolean).join(", ") };
+  if (found.length === 0) return null;
+  return { severity: errors > 0 ? "error" : "warning", details: found.map((item) => item.detail), text: [count(errors, "error"), count(warnings, "warning")].filter(Boolean).join(", ") };
 }

@@ -2,10 +2,10 @@
 
 import { actions, rename, saveMasks } from "./actions.js";
 import { announce, h, marked, put, trouble } from "./dom.js";
-import { bytes, nameOf, stageOf, timeOf } from "./format.js";
+import { bytes, nameOf, stageOf, stateWord, timeOf } from "./format.js";
 import { isAborted, get, send } from "./api.js";
 import { Made } from "./provenance.js";
-import { registration } from "./registration.js";
+import { doubtOf, registration } from "./registration.js";
 import { movieLink } from "./movie.js";
 import { TileMap } from "./tilemap.js";
 import { Verdict } from "./verdict.js";
@@ -51,10 +51,10 @@ export async function job(root, [id], signal) {
   refresh.take = async (now) => {
     if (now === shown) return;
     if (now.state !== shown?.state) {
-      put(state, h("span", { class: `badge ${now.state}` }, now.state));
+      put(state, h("span", { class: `badge ${now.state}` }, stateWord(now.state)));
       put(buttons, actions(now, (action) => (action === "delete" ? leave() : refresh(null)), [renaming]));
       put(problem, now.error && failure(now));
-      if (shown) announce(`The job is ${now.state}`);
+      if (shown) announce(`The job is ${stateWord(now.state)}`);
     }
     call(nameOf(now));
     put(progress, line(now));
@@ -62,7 +62,7 @@ export async function job(root, [id], signal) {
     viewer.setTruth(now.truth);
     if (now.registered !== shown?.registered || now.state !== shown?.state) {
       const card = registration(now);
-      if (now.state === "succeeded" && now.registered?.applied) card.append(...saveMasks(now));
+      if (now.state === "succeeded" && now.registered?.applied && !doubtOf(now)) card.append(...saveMasks(now));
       put(moved, card);
     }
     await tiles.renew(snapshot.value());
@@ -73,12 +73,16 @@ export async function job(root, [id], signal) {
     shown = now;
   };
   const results = async (now) => {
-    const written = await showFiles(files, now, snapshot.value(), signal);
-    viewer.stand(now, written);
+    const list = await get(`/v1/jobs/${now.id}/snapshots/${snapshot.value()}`, signal);
+    viewer.stand(now, list.ready);
     const place = `/v1/jobs/${now.id}/snapshots/${snapshot.value()}/exports/manifest`;
-    const manifest = written ? await get(place, signal).catch((error) => isAborted(error) ? Promise.reject(error) : { error }) : null;
+    const manifest = list.ready ? await read(place, signal) : null;
+    // Findings that withhold the expected PSNR put its map in doubt, too.
+    const withheld = manifest?.content?.assessment?.psnr_db === null;
+    viewer.offerMode("error", !withheld && list.files.some(({ name, href }) => href && name === "error.npy"));
+    showFiles(files, now, { ...list, files: list.files.filter(({ name }) => !(withheld && name === "error.npy")) }, signal);
     await verdict.show(now, manifest, snapshot.value());
-    made.show(now, manifest, place);
+    if (now.state === "succeeded") made.show(now, manifest, place, await read(`/v1/jobs/${now.id}/exports/manifest`, signal));
   };
   const open = async () => {
     await viewer.open(snapshot.value());
@@ -129,13 +133,13 @@ function snapshotChoice(found) {
 function line(now) {
   const { percent, tiles_done: done, tiles_total: total } = now.progress;
   const parts = [
-    now.state !== "succeeded" && `${percent.toFixed(percent < 10 ? 1 : 0)} %`,
+    now.state !== "succeeded" && `${percent.toFixed(percent > 0 && percent < 10 ? 1 : 0)} %`,
     stageOf(now),
     timeOf(now),
     total > 1 && `${done} of ${total} tiles`,
   ];
   const text = h("span", null, parts.filter(Boolean).join(" · "));
-  return now.state === "succeeded" ? text : [h("progress", { max: 100, value: percent, "aria-label": "Progress" }), text];
+  return now.finished_at ? text : [h("progress", { max: 100, value: percent, "aria-label": "Progress" }), text];
 }
 
 const NAMES = { "stack.exr": "EXR stack", "frames.npy": "Array (npy)", "mosaic.npy": "Mosaic (npy)", "error.npy": "Expected error (npy)", "manifest.json": "Manifest" };
@@ -144,10 +148,9 @@ const ORDER = Object.keys(NAMES);
 /** Smallest side in pixels of frames that can be encoded as a movie. */
 const MIN_MOVIE_SIDE = 16;
 
-/** Shows the downloads of a snapshot, and those of the whole job once it has succeeded; true if the snapshot's files are written. */
-async function showFiles(element, { id, state, shape, dispersion, snapshots: { count } }, snapshot, signal) {
+/** Shows the downloads of a snapshot, and those of the whole job once it has succeeded. */
+function showFiles(element, { id, state, shape, dispersion, snapshots: { count } }, { snapshot, ready, files }, signal) {
   const base = `/v1/jobs/${id}`;
-  const { ready, files } = await get(`${base}/snapshots/${snapshot}`, signal);
   // The files' own references are relative to the address of the list.
   const link = (file, main) => h("a", { class: `button small${main ? " primary" : ""}`, href: file.href && `${base}/snapshots/${file.href}`, download: true, title: file.name }, NAMES[file.name] ?? file.name.replace(/^.*\//, ""), h("span", { class: "size" }, bytes(file.size)));
   const whole = files.filter((file) => !file.name.includes("/")).sort((one, other) => ORDER.indexOf(one.name) - ORDER.indexOf(other.name));
@@ -166,5 +169,7 @@ async function showFiles(element, { id, state, shape, dispersion, snapshots: { c
     ready && moves && count > 1 && state === "succeeded" && movieLink(base, null, "mp4", "Movie of all snapshots", signal),
     ready && state === "succeeded" && made(`${base}/exports/zip`, "All files as ZIP"),
     h("details", null, h("summary", null, `${shape.frames} single ${dispersion ? "bands" : "frames"} as EXR and PNG`), h("div", { class: "row" }, single.map((file) => link(file, false)))));
-  return ready;
 }
+
+/** Reads a manifest; an object with the error if the service refuses it. */
+const read = (path, signal) => get(path, signal).catch((error) => (isAborted(error) ? Promise.reject(error) : { error }));

@@ -2,7 +2,7 @@
 
 import { announce, h, place, put, say } from "./dom.js";
 import { cancelAll, removeAll, actions } from "./actions.js";
-import { aboutDecibels, decibels, doubts, expectedRange, measuredVerdict, moment, momentInFull, nameOf, remaining, shapeOf, short, stageOf, verdictOf } from "./format.js";
+import { aboutDecibels, decibels, doubts, expectedRange, measuredVerdict, moment, momentInFull, nameOf, remaining, shapeOf, short, stageOf, stateWord, verdictOf } from "./format.js";
 import { filters } from "./filters.js";
 import { get } from "./api.js";
 import { qualityOf } from "./quality.js";
@@ -246,7 +246,7 @@ function name(cell, job, before) {
 function state(cell, job, before) {
   if (before?.state !== job.state) {
     const running = job.state === "running" || job.state === "cancelling";
-    put(cell, h("span", { class: "line" }, h("span", { class: `badge ${job.state}`, title: job.error }, job.state), running && h("progress", { max: 100, "aria-label": `Progress of ${nameOf(job)}` }), h("span", { class: "muted" })), h("span", { class: "sub" }));
+    put(cell, h("span", { class: "line" }, h("span", { class: `badge ${job.state}`, title: job.error }, stateWord(job.state)), running && h("progress", { max: 100, "aria-label": `Progress of ${nameOf(job)}` }), h("span", { class: "muted" })), h("span", { class: "sub" }));
   }
   const bar = cell.querySelector("progress");
   if (bar) bar.value = job.progress.percent;
@@ -264,7 +264,7 @@ function verdict(cell, job, before) {
   const same = before && before.state === job.state && before.truth === job.truth && before.warnings.length === job.warnings.length && !before.assessment === !job.assessment;
   if (same) return;
   const found = doubts(job);
-  const mark = found && h("span", { class: `mark ${found.severity}`, title: job.warnings.map((item) => item.detail).join("\n") }, found.text);
+  const mark = found && h("span", { class: `mark ${found.severity}`, title: found.details.join("\n") }, found.text);
   const show = (kind, word, psnr) => put(cell, word && h("span", { class: `grade ${kind}` }, word), h("span", { class: "sub" }, mark, psnr && h("span", { class: "psnr" }, mark && " · ", psnr)));
   const expected = () => {
     const [kind, word] = job.state === "succeeded" ? verdictOf(job) : ["", ""];

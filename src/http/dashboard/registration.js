@@ -6,14 +6,31 @@ import { h, s } from "./dom.js";
 /** Displacements in pixels that the arrow's scale fits; the largest one is half the sensor's shorter side. */
 const SCALES = [0.25, 0.5, 1, 2, 4];
 
+/** Findings on the place of the masks, which a registration answers. */
+const ON_PLACE = ["moved_masks", "drifted_masks", "shifted_masks", "misplaced_masks"];
+/** Warnings on the light of a measurement. A wrong dark or full scale changes the fit of the masks, like a motion. */
+const ON_LIGHT = ["no_dark", "wrong_dark", "negative", "negative_offset", "level", "mask_scale", "missing_mask", "saturated"];
+
+/** The first finding that makes the motion that a job has estimated uncertain. */
+export function doubtOf({ registered, warnings }) {
+  return registered?.uncertainty ? warnings.find(({ code, severity }) => !ON_PLACE.includes(code) && (severity === "error" || ON_LIGHT.includes(code))) : undefined;
+}
+
 /** The card of a job; null before the registration, and without one. */
 export function registration(job) {
   const { registered: found } = job;
   if (!found) return null;
+  const doubt = doubtOf(job);
   return h("section", { class: "card", "aria-label": "Registration" }, h("h2", null, "Have the masks moved?"),
-    h("p", { class: "judgement" }, answer(found)),
-    h("p", { class: "muted" }, reason(found)),
-    found.applied && sensor(job));
+    h("p", { class: "judgement" }, doubt ? "Not known" : answer(found)),
+    h("p", { class: "muted" }, doubt ? doubted(found, doubt) : reason(found)),
+    found.applied && !doubt && sensor(job));
+}
+
+/** Why the result of a registration says nothing while another finding stands. */
+function doubted(found, { code }) {
+  const used = found.applied ? `masks that are displaced ${directions(found)}` : "the masks as they were calibrated";
+  return [`The frames use ${used}. While the finding `, h("code", null, code), " stands, no estimate of a motion is reliable: correct it, then reconstruct again."];
 }
 
 function answer({ applied, reason: doubt, shift, rotation, scale, uncertainty }) {
@@ -30,11 +47,11 @@ function reason(found) {
   const { applied, reason: doubt, error_before: before, error_after: after } = found;
   if (doubt && !applied) return `Nothing was corrected: ${doubt}.`;
   const errors = before !== null && after !== null;
-  if (!applied) return errors ? `No displacement lowers the error at hold-out pixels (${percent(before)}) significantly. The frames use the masks as they were calibrated.` : "The frames use the masks as they were calibrated.";
+  if (!applied) return `${errors ? "No displacement lowers the error at hold-out pixels significantly. " : ""}The frames use the masks as they were calibrated.`;
   const way = directions(found);
   if (!errors) return `The frames use masks that are displaced ${way}.`;
-  if (!found.uncertainty) return `The frames use masks that are displaced ${way}. The error at hold-out pixels is ${percent(before)} without this displacement and ${percent(after)} with it.`;
-  return `The masks have moved ${way} since the calibration. The frames use the moved masks, which lowers the error at hold-out pixels from ${percent(before)} to ${percent(after)}. Calibrate again as soon as the optics are stable.`;
+  if (!found.uncertainty) return `The frames use masks that are displaced ${way}. The error at hold-out pixels is ${percent(before)} of the brightness without this displacement and ${percent(after)} with it.`;
+  return `The masks have moved ${way} since the calibration. The frames use the moved masks, which lowers the error at hold-out pixels from ${percent(before)} to ${percent(after)} of the brightness. Calibrate again as soon as the optics are stable.`;
 }
 
 /** With standard errors as many digits as they allow. */

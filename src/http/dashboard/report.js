@@ -89,7 +89,7 @@ function show(body, found) {
   const { masks, captures } = found;
   put(body,
     h("p", { class: `judgement ${found.grade}` }, found.grade[0].toUpperCase() + found.grade.slice(1)),
-    findings(found.findings) ?? h("p", { class: "muted" }, "No problems found."),
+    findings(found.findings) ?? h("p", { class: "muted" }, "No fault found in the masks alone. Each measurement is checked for whether it belongs to them."),
     h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)),
     masks.correlation_mean !== null && h("p", { class: "muted" }, meaning(masks)),
     h("details", null, h("summary", null, "All figures"), facts([

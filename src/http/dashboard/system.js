@@ -47,7 +47,7 @@ function service(found) {
   ]));
 }
 
-const STATES = [["running", "Running"], ["queued", "Waiting"], ["cancelling", "Stopping"], ["succeeded", "Succeeded"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
+const STATES = [["running", "Running"], ["queued", "Waiting"], ["cancelling", "Stopping"], ["succeeded", "Finished"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
 
 function queue(found) {
   const jobs = ([state, word]) => [word, found.jobs[state] === 0 ? "none" : h("a", { href: `#/jobs?state=${state}` }, count(found.jobs[state], "job"))];

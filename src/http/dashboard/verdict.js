@@ -2,7 +2,7 @@
 // against true frames if they are attached.
 
 import { ask } from "./actions.js";
-import { aboutDecibels, axisOf, bytes, decibels, expectedRange, figure, measuredVerdict, verdictOf } from "./format.js";
+import { aboutDecibels, axisOf, bytes, decibels, expectedRange, figure, findingsOf, inUnits, measuredVerdict, verdictOf } from "./format.js";
 import { explained, h, put, say } from "./dom.js";
 import { findings } from "./report.js";
 import { isAborted, get, send, upload } from "./api.js";
@@ -28,14 +28,14 @@ export class Verdict {
     this.grade();
   }
 
-  /** Shows the grade of the calibration, which limits the quality. */
+  /** Shows what the check of the calibration alone has found, which says nothing about its fit to the measurement. */
   async grade() {
     const link = (text) => h("a", { href: `#/calibrations/${this.job.calibration}` }, text);
     try {
       const { grade } = await get(`/v1/calibrations/${this.job.calibration}/report`, this.signal);
-      put(this.calibration, "The ", link("calibration"), " is ", h("span", { class: `grade ${grade}` }, grade), ".");
+      put(this.calibration, grade === "good" ? "No fault found in the " : "Faults found in the ", link("calibration"), " alone", grade !== "good" && [": ", h("span", { class: `grade ${grade}` }, grade)], ".");
     } catch (error) {
-      if (!isAborted(error)) put(this.calibration, "The ", link("calibration"), " has no grade yet.");
+      if (!isAborted(error)) put(this.calibration, "The ", link("calibration"), " is not checked yet.");
     }
   }
 
@@ -54,21 +54,19 @@ export class Verdict {
       return;
     }
     this.assessment = manifest.content?.assessment;
+    this.fullScale = manifest.content?.scale.measurement_full_scale ?? 1;
     if (this.truth) await this.compare(this.truth);
     else this.unmeasured();
   }
 
   /** Shows the expected PSNR from the manifest, with its interval and reasons. */
   showExpected() {
-    const { psnr_db: psnr, reasons } = this.assessment ?? {};
-    const warned = new Set(this.job.warnings.map((warning) => warning.code));
-    const own = reasons?.filter((reason) => !warned.has(reason.code)) ?? [];
-    put(this.expected, this.assessment && [
-      psnr === null
-        ? h("p", { class: "muted" }, "No expected PSNR: the findings put the scale, the dark or the masks in doubt.")
-        : [h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, aboutDecibels(psnr))),
-          h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`)],
-      findings(own)]);
+    const { psnr_db: psnr } = this.assessment ?? {};
+    const own = findings(findingsOf(this.job, this.assessment).slice(this.job.warnings.length));
+    put(this.expected, this.assessment && (psnr === null
+      ? [own, h("p", { class: "muted" }, "No expected PSNR and no map of the expected error: the findings put the scale, the dark or the masks in doubt.")]
+      : [h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, aboutDecibels(psnr))),
+          h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`), own]));
   }
 
   judge(text, kind, why) {
@@ -133,7 +131,7 @@ export class Verdict {
     const curve = found.frames.map((frame) => frame.psnr ?? Infinity);
     const rows = found.frames.map((frame) => [frame.frame, frame.psnr ?? "inf", frame.ssim ?? ""]);
     put(this.measured, h("p", { class: "quality" }, h("b", null, decibels(found.psnr)), " PSNR measured", found.ssim !== null && [", ", h("span", { class: "together" }, h("b", null, figure(found.ssim, 3)), " SSIM")]),
-      h("p", { class: "muted" }, `Against the true frames of this job; mean of ${found.frames.length} ${spectral ? "bands" : "frames"}, relative to the white level ${figure(found.peak)}.`),
+      h("p", { class: "muted" }, `Against the true frames of this job; mean of ${found.frames.length} ${spectral ? "bands" : "frames"}, relative to the white level, ${inUnits(found.peak, this.fullScale)}.`),
       h("details", { open: true }, h("summary", null, spectral ? "PSNR band by band" : "PSNR frame by frame"),
         curve.length > 1 && curve.every(Number.isFinite) && plot(curve, { xName, xs, yName: "PSNR in dB", width: 270 }),
         h("div", { class: "row" }, csvLink(`${this.job.id.slice(-8)}_${this.snapshot}_quality.csv`, [spectral ? "band" : "frame", "psnr_db", "ssim"], rows))));

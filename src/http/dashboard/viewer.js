@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { axisOf, figure, frameName } from "./format.js";
+import { axisOf, figure, frameName, unitOf } from "./format.js";
 import { get, isUnreachable } from "./api.js";
 import { Probe } from "./probe.js";
 import { sampled } from "./values.js";
@@ -46,6 +46,7 @@ export class Viewer {
     if (job.snapshots.count > 1) this.player.element.lastChild.append(h("label", { for: "through", class: "row muted" }, this.through, "Play all snapshots"));
     this.choice = h("select", { id: "mode", "aria-label": "Image" }, MODES.map(([value, text, band]) => h("option", { value }, spectral ? band : text)));
     this.offerMode("colours", Boolean(job.dispersion?.wavelengths));
+    this.offerMode("error", false);
     this.setTruth(job.truth);
     this.meaning = h("p", { class: "muted meaning", "aria-live": "polite" });
     this.choice.addEventListener("change", () => {
@@ -87,9 +88,9 @@ export class Viewer {
       small("Fit the whole picture", "Fit", () => this.view.fit()), small("1 : 1, one screen pixel per image pixel", "1 : 1", () => this.nearer(null)), full];
   }
 
-  /** Factor and words of the unit of values: the camera's counts, or multiples of a full scale of 1. */
+  /** Factor and words of the unit of values. */
   unit() {
-    return { factor: this.fullScale, words: this.fullScale === 1 ? "× full scale" : "counts" };
+    return unitOf(this.fullScale);
   }
 
   /** A value in the user's units. */
