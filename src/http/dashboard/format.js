@@ -165,9 +165,12 @@ export function findingsOf({ warnings }, assessment) {
  */
 export function verdictOf(job, assessment = job.assessment) {
   if (findingsOf(job, assessment).some((item) => item.severity === "error")) return ["bad", "bad", "Bad", "The checks found errors that make the frames wrong:"];
+  const likely = () => [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `${limitOf(assessment)} ${LIKE[assessment.grade]}`];
+  // A warning makes a bad result no better.
+  if (assessment?.grade === "bad" && assessment.psnr_db !== null) return likely();
   if (job.warnings.length > 0) return ["usable", "doubtful", "Doubtful", "The checks found problems that may degrade the frames:"];
   if (assessment?.psnr_db === null) return ["usable", "doubtful", "Doubtful", "The quality of these frames can’t be predicted:"];
-  if (assessment) return [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `${limitOf(assessment)} ${LIKE[assessment.grade]}`];
+  if (assessment) return likely();
   return ["unknown", "not judged", "Not judged", "Measurement and calibration fit each other. No quality can be predicted for this algorithm or sensor. Attach true frames, if you have them, to measure it."];
 }
 
