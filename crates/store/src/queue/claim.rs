@@ -183,27 +183,61 @@ macro_rules! take_text {
     };
 }
 
+/// Condition for the check of a user's network.
+macro_rules! network_check {
+    () => {
+        "(kind = 'check' AND EXISTS (SELECT 1 FROM requests WHERE requests.id = tasks.thing AND what = 'model'))"
+    };
+}
+
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
     fn look(self) -> &'static str {
         match self {
-            Self::Local => look_text!("", "tasks_ready"),
-            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "tasks_others"),
-            Self::Light => look_text!("AND light = 1", "tasks_light", "tasks_light_of_job"),
+            Self::Local => look_text!(concat!("AND NOT ", network_check!()), "tasks_ready"),
+            Self::WithoutTiles => {
+                look_text!(concat!("AND kind <> 'tile' AND NOT ", network_check!()), "tasks_others")
+            }
+            Self::Light => look_text!(
+                concat!("AND light = 1 AND NOT ", network_check!()),
+                "tasks_light",
+                "tasks_light_of_job"
+            ),
+            Self::Networks => look_text!(
+                concat!("AND light = 1 AND job IS NULL AND ", network_check!()),
+                "tasks_light"
+            ),
             Self::Pool(_) => look_text!("AND kind = 'tile'", "tasks_tiles"),
         }
     }
 
     fn take(self) -> &'static str {
         match self {
-            Self::Local => take_text!("", "", "tasks_ready", "tasks_ready_of_job"),
-            Self::WithoutTiles => {
-                take_text!("AND kind <> 'tile'", "", "tasks_others", "tasks_others_of_job")
-            }
+            Self::Local => take_text!(
+                concat!("AND NOT ", network_check!()),
+                "",
+                "tasks_ready",
+                "tasks_ready_of_job"
+            ),
+            Self::WithoutTiles => take_text!(
+                concat!("AND kind <> 'tile' AND NOT ", network_check!()),
+                "",
+                "tasks_others",
+                "tasks_others_of_job"
+            ),
             // It begins no job.
-            Self::Light => {
-                take_text!("AND light = 1", " AND job IS NULL", "tasks_light", "tasks_light_of_job")
-            }
+            Self::Light => take_text!(
+                concat!("AND light = 1 AND NOT ", network_check!()),
+                " AND job IS NULL",
+                "tasks_light",
+                "tasks_light_of_job"
+            ),
+            Self::Networks => take_text!(
+                concat!("AND light = 1 AND ", network_check!()),
+                " AND job IS NULL",
+                "tasks_light",
+                "tasks_light_of_job"
+            ),
             Self::Pool(_) => {
                 take_text!("AND kind = 'tile'", "", "tasks_tiles", "tasks_tiles_of_job")
             }
@@ -490,6 +524,7 @@ mod tests {
         let store = Store::open(folder.path(), purpose).await.unwrap();
         // The look for leases that have run out reads what runs.
         let (no_tiles, light) = (Claimant::WithoutTiles, Claimant::Light);
+        let networks = Claimant::Networks;
         let pool = Claimant::Pool("gpu");
         for (text, index, others) in [
             (pool.look(), "INDEX tasks_tiles", 1),
@@ -498,6 +533,8 @@ mod tests {
             (no_tiles.take(), "INDEX tasks_others", 0),
             (light.look(), "INDEX tasks_light", 1),
             (light.take(), "INDEX tasks_light", 0),
+            (networks.look(), "INDEX tasks_light", 1),
+            (networks.take(), "INDEX tasks_light", 0),
         ] {
             let plan = plan(&store, text).await;
             let good = [index, "PRIMARY KEY (id=?)"];
