@@ -529,7 +529,7 @@ async fn a_manifest_repeats_a_job_and_names_what_is_missing() {
     let (other, _) = done(&lab, &other).await;
     let different = lab.refused(1, &["watch", &other, "--manifest", manifest]).await;
     assert!(different.contains("different from the manifest"), "{different}");
-    assert!(different.contains("requests.job.tile.size is 32"), "{different}");
+    assert!(different.contains("request.tile.size is 32"), "{different}");
 
     // Another service has none of the inputs.
     let app = TestApp::with(&["--workers", "1"]).await;

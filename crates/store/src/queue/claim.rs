@@ -18,7 +18,7 @@ use crate::tables::things::{Calibration, Measurement, Thing};
 use crate::tables::workers::{self, Claimant};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Lab, MovieFormat, Registered,
-    Repetition, Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
+    Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
 };
 use engine::pipeline::derived::STACK;
 
@@ -63,8 +63,6 @@ pub struct JobTask {
     pub tiles: Vec<TileResult>,
     /// For the manifest: all other tasks of the job, in order.
     pub records: Vec<TaskRecord>,
-    /// For the manifest: the requests that repeat the job.
-    pub repetition: Option<Repetition>,
 }
 
 /// The check of a request's uploads.
@@ -335,14 +333,11 @@ impl Store {
             facts.fetch_one(&self.readers).await?;
         let calibration = self.thing_of_any_lab(spec.calibration).await?;
         let measurement = self.thing_of_any_lab(spec.measurement).await?;
-        let (mut tiles, mut records, mut repetition) = (Vec::new(), Vec::new(), None);
+        let (mut tiles, mut records) = (Vec::new(), Vec::new());
         match kind {
             TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
             TaskKind::White => tiles = self.all_tile_results(job).await?,
-            TaskKind::Manifest => {
-                records = self.task_records(job).await?;
-                repetition = self.repetition(&spec).await?;
-            }
+            TaskKind::Manifest => records = self.task_records(job).await?,
             _ => {}
         }
         let [prepared, pilot, white] =
@@ -357,23 +352,7 @@ impl Store {
             white,
             tiles,
             records,
-            repetition,
         })))
-    }
-
-    /// The requests that repeat a job.
-    async fn repetition(&self, spec: &JobSpec) -> Result<Option<Repetition>> {
-        let mut connection = self.readers.acquire().await?;
-        let masks = requests::find(&mut connection, spec.calibration.into()).await?.submission;
-        let data = requests::find(&mut connection, spec.measurement.into()).await?.submission;
-        let (Submission::Calibration(masks), Submission::Measurement(data)) = (masks, data) else {
-            return Ok(None);
-        };
-        let decode = |error: serde_json::Error| StoreError::Corrupt {
-            column: "request",
-            value: error.to_string(),
-        };
-        Repetition::new(&masks, &data, spec).map(Some).map_err(decode)
     }
 
     async fn movie_work(
