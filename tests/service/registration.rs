@@ -280,6 +280,13 @@ async fn corrected_masks_become_a_calibration() {
     }
     let body = json!({"registration_of": auto["id"], "full_scale": 255});
     app.post("/v1/calibrations", &body).await.problem(422, "invalid_request");
+    // The job can't be deleted while the calibration is not made.
+    let pending = "UPDATE requests SET prepared = NULL, facts = NULL WHERE id = ?";
+    let mut database = app.database().await;
+    sqlx::query(pending).bind(saved).execute(&mut database).await.unwrap();
+    let job = format!("/v1/jobs/{}", auto["id"].as_str().unwrap());
+    let detail = app.delete(&job).await.problem(409, "in_use");
+    assert!(detail.contains(saved), "{detail}");
     app.sign_in(&app.token(&["create", "--lab", "another"]));
     let unknown = save(&auto).await;
     unknown.problem(422, "invalid_request");
