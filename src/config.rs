@@ -153,7 +153,7 @@ pub struct ServeArguments {
           value_parser = clap::value_parser!(u64).range(1..))]
     pub request_seconds: u64,
 
-    /// Seconds that the check of a file for a calibration or measurement may take.
+    /// Seconds that the check of a file for a calibration, a measurement or a model may take.
     #[arg(long, env = "SCI_RECON_CHECK_SECONDS", value_name = "SECONDS", default_value_t = 300.0, value_parser = seconds)]
     pub check_seconds: f64,
 
@@ -363,16 +363,17 @@ pub enum Takes {
     All,
     /// All except tiles, which are left to other machines.
     WithoutTiles,
-    /// Short tasks, which must not wait for tiles.
+    /// Short tasks, which must not wait for tiles, and at the same time checks of users' networks, one after the other.
     Light,
 }
 
-impl From<Takes> for Claimant<'static> {
-    fn from(takes: Takes) -> Self {
-        match takes {
-            Takes::All => Self::Local,
-            Takes::WithoutTiles => Self::WithoutTiles,
-            Takes::Light => Self::Light,
+impl Takes {
+    /// The claimants of a worker. Each takes one task at a time.
+    pub fn claimants(self) -> &'static [Claimant<'static>] {
+        match self {
+            Self::All => &[Claimant::Local],
+            Self::WithoutTiles => &[Claimant::WithoutTiles],
+            Self::Light => &[Claimant::Light, Claimant::Networks],
         }
     }
 }

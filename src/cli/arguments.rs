@@ -12,7 +12,8 @@ use super::confine::{confine_network, folders_of, limit_memory};
 use crate::cli::error::Result;
 use crate::config::device;
 use engine::job::{
-    Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, RegistrationRequest,
+    Algorithm, CalibrationId, CalibrationRequest, Dispersion, DispersionAxis, InvalidField, Label,
+    MaskExtent, MeasurementRequest, RegistrationRequest, Sha256,
 };
 use engine::pipeline::NetworkSource;
 use formats::{Axes, Crop, Packing};
@@ -43,7 +44,7 @@ pub(super) struct ScheduleArguments {
 pub(super) struct MaskFileArguments {
     /// Name of the masks in an npz, .mat or HDF5 file [default: mask, or the only array].
     #[arg(long, value_name = "NAME")]
-    pub(super) masks_array: Option<String>,
+    pub(super) masks_array: Option<Label>,
     /// The order of the axes of the masks [default: the only one that fits].
     #[arg(long, value_name = "ORDER", value_parser = named::<Axes>())]
     pub(super) masks_axes: Option<Axes>,
@@ -61,12 +62,27 @@ pub(super) struct MaskFileArguments {
     pub(super) bad_pixels: Option<PathBuf>,
 }
 
+impl MaskFileArguments {
+    /// The request for masks of this upload, with the options of its file.
+    pub(super) fn request(&self, masks: Sha256) -> CalibrationRequest {
+        CalibrationRequest {
+            masks: Some(masks),
+            array: self.masks_array.clone(),
+            axes: self.masks_axes,
+            crop: self.masks_crop,
+            frames: self.masks_frames,
+            packing: self.masks_packing,
+            ..CalibrationRequest::default()
+        }
+    }
+}
+
 /// Options for reading a file of snapshots, and for its correction.
 #[derive(Debug, Args)]
 pub(super) struct SnapshotFileArguments {
     /// Name of the snapshots in an npz, .mat or HDF5 file [default: meas, or the only array].
     #[arg(long, value_name = "NAME")]
-    pub(super) array: Option<String>,
+    pub(super) array: Option<Label>,
     /// The order of the axes of the snapshots [default: the only one that fits].
     #[arg(long, alias = "measurement-axes", value_name = "ORDER", value_parser = named::<Axes>())]
     pub(super) axes: Option<Axes>,
@@ -82,6 +98,26 @@ pub(super) struct SnapshotFileArguments {
     /// The stored number at and above which a pixel is saturated [default: the largest one, if pixels pile up there].
     #[arg(long, value_name = "NUMBER")]
     pub(super) saturation: Option<u32>,
+}
+
+impl SnapshotFileArguments {
+    /// The request for snapshots of this upload, with the options of its file.
+    pub(super) fn request(
+        &self,
+        calibration: CalibrationId,
+        data: Sha256,
+        dark: Vec<Sha256>,
+    ) -> MeasurementRequest {
+        MeasurementRequest {
+            array: self.array.clone(),
+            axes: self.axes,
+            crop: self.crop,
+            packing: self.packing,
+            dark,
+            saturation: self.saturation,
+            ..MeasurementRequest::new(None, calibration, data)
+        }
+    }
 }
 
 /// The displacement of the bands of a spectral camera.

@@ -19,7 +19,7 @@ const SCHEMA: &str = "sci-recon/job/1";
 /// File with the frames of a snapshot.
 const FRAMES: &str = "frames.npy";
 /// Parts of the content that are not computed from the others.
-const SETTINGS: [&str; 3] = ["program_version", "requests", "models"];
+const SETTINGS: [&str; 4] = ["program_version", "inputs", "request", "models"];
 /// Differences and snapshots that are listed. Further ones are counted.
 const LISTED: usize = 8;
 
@@ -54,12 +54,11 @@ struct Run {
     model: Option<String>,
 }
 
-/// The requests that repeat a job.
+/// The requests that repeat the inputs of a job.
 #[derive(Debug, Deserialize)]
-struct Requests {
+struct Inputs {
     calibration: Map<String, Value>,
     measurement: Map<String, Value>,
-    job: Map<String, Value>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -90,9 +89,9 @@ impl Manifest {
             }
             _ => return Err(refused(format!("this is no manifest: {whole}"))),
         }
-        if value["content"]["requests"].is_null() {
+        if value["content"]["request"].is_null() {
             let text =
-                "an earlier version has written this manifest, which lacks the requests of the job";
+                "an earlier version has written this manifest, which lacks the request of the job";
             return Err(refused(text.into()));
         }
         Self::parse(value).map_err(|error| refused(format!("a damaged manifest: {error}")))
@@ -101,7 +100,8 @@ impl Manifest {
     /// Errors: a value of another form. All parts are parsed once.
     fn parse(value: Value) -> serde_json::Result<Self> {
         let manifest: Self = serde_json::from_value(value)?;
-        manifest.part::<Requests>("requests")?;
+        manifest.part::<Inputs>("inputs")?;
+        manifest.part::<Map<String, Value>>("request")?;
         manifest.part::<Vec<Snapshot>>("snapshots")?;
         Ok(manifest)
     }
@@ -110,14 +110,13 @@ impl Manifest {
         T::deserialize(self.content.get(name).unwrap_or(&Value::Null))
     }
 
-    fn requests(&self) -> Result<Requests> {
-        self.part("requests").map_err(|error| CliError::Failure(error.to_string()))
+    fn read_part<T: for<'de> Deserialize<'de>>(&self, name: &str) -> Result<T> {
+        self.part(name).map_err(|error| CliError::Failure(error.to_string()))
     }
 
     /// Hashes of the frames of all snapshots.
     fn frames(&self) -> Result<BTreeMap<u32, Sha256>> {
-        let snapshots: Vec<Snapshot> =
-            self.part("snapshots").map_err(|error| CliError::Failure(error.to_string()))?;
+        let snapshots: Vec<Snapshot> = self.read_part("snapshots")?;
         let frames = |Snapshot { snapshot, files }| {
             let array = files.into_iter().find(|file| file.name == FRAMES)?;
             Some((snapshot, array.sha256))
@@ -142,7 +141,8 @@ impl Manifest {
         plain: &PlainArguments,
         key: &str,
     ) -> Result<Value> {
-        let Requests { calibration, mut measurement, mut job } = self.requests()?;
+        let Inputs { calibration, mut measurement } = self.read_part("inputs")?;
+        let mut job: Map<String, Value> = self.read_part("request")?;
         let Run { label, truth_sha256: truth, .. } = &self.run;
         let masks = Input::new(client, "calibrations", Some(&self.run.calibration)).await?;
         let masks = masks.made_of(uploads("masks", &calibration));
@@ -412,7 +412,8 @@ mod tests {
             "schema": super::SCHEMA,
             "content": {
                 "program_version": "1",
-                "requests": {"calibration": {}, "measurement": {}, "job": {"tile": {"size": size}}},
+                "inputs": {"calibration": {}, "measurement": {}},
+                "request": {"tile": {"size": size}},
                 "snapshots": snapshots,
             },
             "run": {"calibration": "c", "measurement": "m"},
@@ -433,7 +434,7 @@ mod tests {
         let other = compared(manifest(&["a", "b"], 64), manifest(&["a", "c"], 32)).failure("x");
         let other = other.unwrap();
         assert!(other.contains("other frames of snapshot 1. Cause"), "{other}");
-        assert!(other.ends_with("Cause: requests.job.tile.size is 32, and was 64"), "{other}");
+        assert!(other.ends_with("Cause: request.tile.size is 32, and was 64"), "{other}");
         let missing = compared(manifest(&["a"], 64), manifest(&["a", "b"], 64)).failure("x");
         assert!(missing.unwrap().contains("another processor or GPU"), "the same settings");
         assert!(compared(manifest(&[], 64), manifest(&[], 64)).failure("x").is_some());
@@ -452,7 +453,7 @@ mod tests {
         let snapshot = json!({"schema": "sci-recon/snapshot/1"}).to_string();
         assert!(refused(snapshot).contains("the manifest of a snapshot"));
         let mut old = manifest(&["a"], 64);
-        old["content"]["requests"].take();
+        old["content"]["request"].take();
         assert!(refused(old.to_string()).contains("an earlier version"));
         let mut damaged = manifest(&["a"], 64);
         damaged["run"]["measurement"].take();

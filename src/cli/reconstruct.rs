@@ -26,9 +26,12 @@ use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Dispersion, Finding, Inputs, MaskInputs, MeasurementInputs, Mosaic,
-    Registered, RegistrationRequest, SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
+    Algorithm, Assessment, CalibrationId, CalibrationRequest, Dispersion, Finding, Inputs,
+    MeasurementRequest, Mosaic, Registered, RegistrationRequest, SceneShape, Schedule, Sequence,
+    Sha256, keeps_mosaic,
 };
+use engine::pipeline::PipelineError;
+use engine::pipeline::arrays::{hide_uncovered, known, light};
 use engine::pipeline::manifest::{Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::pilot::full_schedule;
@@ -41,6 +44,7 @@ use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{OnDisk, check_output, replace_result, write_result};
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, Limits, Part, planar};
+use reconstruction::registration::Correction;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::{TilePlan, Window};
 
@@ -291,7 +295,7 @@ impl<'a> Sources<'a> {
                 SceneArray::Masks,
                 arguments.masks_full_scale,
             )
-            .named(arguments.mask_file.masks_array.clone())
+            .named(arguments.mask_file.masks_array.as_ref().map(ToString::to_string))
             .arranged(arguments.mask_file.masks_axes, None)
             .part(
                 Part {
@@ -306,7 +310,7 @@ impl<'a> Sources<'a> {
                 SceneArray::Measurements,
                 arguments.full_scale,
             )
-            .named(arguments.snapshot_file.array.clone())
+            .named(arguments.snapshot_file.array.as_ref().map(ToString::to_string))
             .arranged(arguments.snapshot_file.axes, None)
             .part(
                 Part { crop: arguments.snapshot_file.crop, frames: None },
@@ -342,7 +346,7 @@ struct Input<'a> {
 impl<'a> Input<'a> {
     fn read(arguments: &'a Arguments) -> Result<Self> {
         let mut sources = Sources::new(arguments)?;
-        let mut masks = read_masks(&sources.masks, arguments.mask_file.bad_pixels.as_deref())
+        let masks = read_masks(&sources.masks, arguments.mask_file.bad_pixels.as_deref())
             .map_err(|error| CliError::from(error).about(Role::Masks))?;
         let (frames, height, width) = masks.array.dim();
         sources.measurement.size = Some((height, width));
@@ -357,7 +361,6 @@ impl<'a> Input<'a> {
         let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
         let behind =
             Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
-        masks.array.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
         let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))
             .map_err(|error| CliError::from(error).about(Role::Measurement))?;
         let (measurement, snapshots) = (read.measurement, read.count);
@@ -433,22 +436,29 @@ impl<'a> Input<'a> {
         self.first..self.first + self.measurement.array.dim().0
     }
 
+    /// The light of the masks after a correction, as in a job.
+    fn light(&self, correction: Option<Correction>) -> Result<Array2<f32>, PipelineError> {
+        let (_, height, width) = self.masks.array.dim();
+        let masks = self.masks.array.outer_iter().map(|mask| Ok(mask.to_owned()));
+        light(masks, (height, width), correction)
+    }
+
     /// The solver's common scale of all snapshots, as in a job.
-    fn white(&self) -> Result<f32> {
-        Ok(white(self.masks.array.view(), self.measurement.array.view())?)
+    fn white(&self, correction: Option<Correction>) -> Result<f32> {
+        Ok(white(self.light(correction)?, self.measurement.array.view())?)
     }
 
     /// Registers the masks by the first snapshot, as a job does, and moves them. Snapshots become NaN where no mask is
-    /// known. Returns the white level.
+    /// known, and unknown masks 0. Returns the white level.
     fn register(&mut self, request: RegistrationRequest) -> Result<f32> {
-        let white = self.white()?;
+        let mut white = self.white(None)?;
         let masks = self.masks.array.view();
         let is_coloured = self.mosaic.is_some() || self.sources.masks.dispersion.is_some();
         if request.error(is_coloured).is_some() {
             let text = "--registration: masks of a colour sensor or spectral camera are not moved; calibrate again";
             return Err(CliError::Input(text.into()));
         }
-        let light = || Ok(masks.sum_axis(Axis(0)));
+        let light = || self.light(None);
         let y = &self.measurement.array.index_axis(Axis(0), 0) / white;
         let piece = |place: &Window| {
             Ok(masks.slice(s![.., place.rows.clone(), place.columns.clone()]).to_owned())
@@ -460,49 +470,42 @@ impl<'a> Input<'a> {
             self.findings.retain(|finding| !superseded.iter().any(|code| finding.is(*code)));
             self.findings.extend(registered.findings());
         }
-        if let Some(correction) = registered.as_ref().and_then(Registered::correction) {
-            let moved = registration::moved(masks, correction);
-            for mut snapshot in self.measurement.array.outer_iter_mut() {
-                let first = moved.index_axis(Axis(0), 0);
-                snapshot.zip_mut_with(&first, |y, mask| {
-                    if mask.is_nan() {
-                        *y = f32::NAN;
-                    }
-                });
-            }
-            self.masks.array = moved.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+        let correction = registered.as_ref().and_then(Registered::correction);
+        if registered.as_ref().is_some_and(Registered::changes_white_level) {
+            white = self.white(correction)?;
         }
+        if let Some(correction) = correction {
+            let (_, height, width) = self.masks.array.dim();
+            let place = Window { rows: 0..height, columns: 0..width, step: 1 };
+            let moved = registration::moved(self.masks.array.view(), correction);
+            hide_uncovered(&mut self.measurement.array, (height, width), &place, correction);
+            self.masks.array = moved;
+        }
+        self.masks.array.mapv_inplace(known);
         self.registration = registered;
-        let changes_white = self.registration.as_ref().is_some_and(Registered::changes_white_level);
-        if changes_white { self.white() } else { Ok(white) }
+        Ok(white)
     }
 
     /// The origin of masks and snapshots, as a job records it.
     fn inputs(&self, arguments: &Arguments) -> Result<Inputs> {
         let (masks, snapshots) = (&arguments.mask_file, &arguments.snapshot_file);
-        let bad_pixels = masks.bad_pixels.as_deref().map(sha256).transpose()?;
-        let dark = snapshots.dark.iter().map(|file| sha256(file));
+        let file = sha256(self.sources.masks.path)?;
+        let calibration = CalibrationRequest {
+            full_scale: arguments.masks_full_scale,
+            mosaic: arguments.mosaic,
+            dispersion: self.sources.masks.dispersion.clone(),
+            bad_pixels: masks.bad_pixels.as_deref().map(sha256).transpose()?,
+            ..masks.request(file)
+        };
+        let dark: Result<Vec<Sha256>> = snapshots.dark.iter().map(|file| sha256(file)).collect();
+        let measurement = MeasurementRequest {
+            full_scale: arguments.full_scale,
+            ..snapshots.request(CalibrationId::new(), sha256(self.sources.measurement.path)?, dark?)
+        };
+        let axes = |axes: Option<Axes>| axes.map(|axes| axes.to_string());
         Ok(Inputs {
-            masks: MaskInputs {
-                masks_sha256: sha256(self.sources.masks.path)?,
-                masks_axes: self.masks.axes.map(|axes| axes.to_string()),
-                masks_array: masks.masks_array.clone(),
-                masks_crop: masks.masks_crop,
-                masks_frames: masks.masks_frames,
-                masks_packing: masks.masks_packing,
-                bad_pixels_sha256: bad_pixels,
-                captures: None,
-                registration_of: None,
-            },
-            measurement: MeasurementInputs {
-                measurement_sha256: sha256(self.sources.measurement.path)?,
-                measurement_axes: self.measurement.axes.map(|axes| axes.to_string()),
-                measurement_array: snapshots.array.clone(),
-                measurement_crop: snapshots.crop,
-                measurement_packing: snapshots.packing,
-                dark_sha256: dark.collect::<Result<_>>()?,
-                saturation: snapshots.saturation,
-            },
+            masks: calibration.inputs(file, axes(self.masks.axes), None),
+            measurement: measurement.inputs(axes(self.measurement.axes)),
         })
     }
 

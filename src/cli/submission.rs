@@ -13,7 +13,8 @@ use super::arguments::{
 use super::client::{Client, Result};
 use super::fields::Role;
 use engine::job::{
-    Algorithm, CalibrationId, Dispersion, JobId, Mosaic, RegistrationRequest, Sequence, Sha256,
+    Algorithm, CalibrationId, CalibrationRequest, Dispersion, JobId, Label, Mosaic,
+    RegistrationRequest, Sequence, Sha256, fields,
 };
 
 /// Options of the calibration, the measurement and the job.
@@ -36,10 +37,10 @@ pub(super) struct SubmissionArguments {
     mask_file: MaskFileArguments,
     /// The stored number in the masks that means 1, fully open [default: that of their type].
     #[arg(long, value_name = "NUMBER", conflicts_with = "calibration", help_heading = CALIBRATION)]
-    masks_full_scale: Option<f64>,
+    masks_full_scale: Option<f32>,
     /// Name of the calibration [default: none].
     #[arg(long, value_name = "TEXT", conflicts_with = "calibration", help_heading = CALIBRATION)]
-    masks_name: Option<String>,
+    masks_name: Option<Label>,
     /// The colours of the sensor's pixels, row by row of a 2x2 cell [default: a grey sensor].
     #[arg(long, value_name = "NAME", conflicts_with = "calibration", value_parser = named::<Mosaic>(),
           help_heading = CALIBRATION)]
@@ -200,7 +201,7 @@ impl SubmissionArguments {
                 };
                 let sent = client.upload_with_bar(masks).await?;
                 let body = self.calibration_request(sent, bad_pixels, dispersion);
-                let created = create_calibration(client, &body).await;
+                let created = create_calibration(client, &Value::Object(body)).await;
                 created.map_err(|error| error.about(Role::Masks, masks))?
             }
             (None, None, Some(job)) => {
@@ -236,19 +237,16 @@ impl SubmissionArguments {
         masks: Sha256,
         bad_pixels: Option<Sha256>,
         dispersion: Option<Dispersion>,
-    ) -> Value {
-        let mut body = Map::from_iter([("masks".to_owned(), json!(masks))]);
-        add(&mut body, "array", json!(self.mask_file.masks_array));
-        add(&mut body, "axes", json!(self.mask_file.masks_axes));
-        add(&mut body, "crop", json!(self.mask_file.masks_crop));
-        add(&mut body, "frames", json!(self.mask_file.masks_frames));
-        add(&mut body, "packing", json!(self.mask_file.masks_packing));
-        add(&mut body, "full_scale", json!(self.masks_full_scale));
-        add(&mut body, "mosaic", json!(self.mosaic));
-        add(&mut body, "dispersion", json!(dispersion));
-        add(&mut body, "bad_pixels", json!(bad_pixels));
-        add(&mut body, "name", json!(self.masks_name));
-        Value::Object(body)
+    ) -> Map<String, Value> {
+        let request = CalibrationRequest {
+            name: self.masks_name.clone(),
+            full_scale: self.masks_full_scale,
+            mosaic: self.mosaic,
+            dispersion,
+            bad_pixels,
+            ..self.mask_file.request(masks)
+        };
+        fields(&request, &[])
     }
 
     /// A request for a measurement, without its data.
@@ -425,7 +423,7 @@ mod tests {
         let calibration = arguments.calibration_request(sha256, Some(sha256), dispersion);
         // Captures of many files are for `calibrate`, the dashboard and the client libraries; `registration_of` replaces files.
         let expected = properties("CalibrationRequest", &["captures", "registration_of"]);
-        assert_eq!(names(calibration.as_object().unwrap()), expected);
+        assert_eq!(names(&calibration), expected);
         let measurement = arguments.measurement_request("id", &[sha256]);
         assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
         let job = arguments.job_request(arguments.schedule().unwrap(), Some(sha256));

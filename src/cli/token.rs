@@ -193,6 +193,7 @@ impl From<StoreError> for CliError {
             | StoreError::NotFinal(_)
             | StoreError::Ended(_)
             | StoreError::InUse { .. }
+            | StoreError::JobInUse(_)
             | StoreError::FileInUse(_) => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use futures_util::future::try_join_all;
 use tokio::io::AsyncReadExt;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
@@ -20,7 +21,7 @@ use crate::config::WorkerArguments;
 use engine::job::WorkerId;
 use engine::pipeline::networks::NetworkSource;
 use reconstruction::priors::onnx::Device;
-use store::{Purpose, Store, StoreError};
+use store::{Claimant, Purpose, Store, StoreError};
 #[cfg(feature = "nats")]
 use workers::nats::{ClusterError, Program, Remote, RemoteSettings};
 use workers::{Local, ModelCommand, Worker, WorkerError};
@@ -122,11 +123,14 @@ async fn work(
         return Ok(ended?);
     }
     let store = Store::open(settings.data_folder().unwrap_or(Path::new("")), Purpose::Use).await?;
-    let local =
-        Local::new(store.clone(), id, settings.takes.into(), settings.engine.device.clone());
-    let ended = Worker::new(local, network, model, cores, stall, stop).run().await;
+    let run = |claimant: &Claimant<'static>| {
+        let local = Local::new(store.clone(), id, *claimant, settings.engine.device.clone());
+        Worker::new(local, network.clone(), model.clone(), cores, stall, stop.clone()).run()
+    };
+    let ended = try_join_all(settings.takes.claimants().iter().map(run)).await;
     store.close().await;
-    Ok(ended?)
+    ended?;
+    Ok(())
 }
 
 #[cfg(feature = "nats")]

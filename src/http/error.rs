@@ -314,7 +314,9 @@ impl From<StoreError> for ApiError {
             StoreError::NotFound { .. } => Code::NotFound,
             StoreError::NotReady { what: "calibration", .. } => Code::CalibrationNotReady,
             StoreError::NotReady { .. } => Code::MeasurementNotReady,
-            StoreError::InUse { .. } | StoreError::FileInUse(_) => Code::InUse,
+            StoreError::InUse { .. } | StoreError::JobInUse(_) | StoreError::FileInUse(_) => {
+                Code::InUse
+            }
             StoreError::State(_) | StoreError::NotFinal(_) | StoreError::Ended(_) => {
                 Code::IllegalState
             }

@@ -200,7 +200,14 @@ where
     };
     let origin = REQUEST_ID.try_with(Clone::clone).ok();
     let new = NewRequest { submission: submission.clone(), limits, origin };
-    Ok(app.store.request((&access.lab, access.token), &new, key).await?)
+    match app.store.request((&access.lab, access.token), &new, key).await {
+        // A reference was deleted since its check, which states the place of the reference.
+        Err(error @ StoreError::NotFound { .. }) => {
+            check_references(app, &access.lab, submission).await?;
+            Err(error.into())
+        }
+        inserted => Ok(inserted?),
+    }
 }
 
 /// Waits for a check. Returns false if the request was deleted.

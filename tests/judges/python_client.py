@@ -91,7 +91,7 @@ def repeated(client, result, folder):
     assert again.differences(result.manifest) == []
     unknown = json.loads(json.dumps(result.manifest))
     unknown["run"]["calibration"] = unknown["run"]["measurement"] = str(uuid.uuid4())
-    unknown["content"]["requests"]["measurement"]["data"] = "0" * 64
+    unknown["content"]["inputs"]["measurement"]["data"] = "0" * 64
     try:
         client.repeat(unknown, [folder / "masks.npy"])
         raise AssertionError("a job without its measurement was submitted")

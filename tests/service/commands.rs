@@ -354,13 +354,20 @@ async fn permanent_failures_end_a_command_at_once_and_others_are_retried() {
     command.args(["ls", "--url", &url]).env("SSL_CERT_FILE", lab.path("authority.pem"));
     let output = command.output().await.unwrap();
     assert!(String::from_utf8_lossy(&output.stderr).contains("404"), "{output:?}");
-    // A variable that names no certificate is refused by its name.
-    let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
-    command.args(["ls", "--url", &url]).env("SSL_CERT_FILE", lab.path("lost.pem"));
-    let output = command.output().await.unwrap();
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2), "{text}");
-    assert!(text.contains("SSL_CERT_FILE names") && text.contains("lost.pem"), "{text}");
+    // A variable that names no certificate is refused by its name, even if the folder of certificates is good.
+    lab.write("text.pem", b"no certificate");
+    let folder = lab.path("authorities");
+    std::fs::create_dir(&folder).unwrap();
+    std::fs::write(folder.join("8d33f237.0"), certificate.as_bytes()).unwrap();
+    for (name, why) in [("lost.pem", "can't be read"), ("text.pem", "no certificate in PEM form")] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        command.args(["ls", "--url", &url]).env("SSL_CERT_DIR", &folder);
+        let output = command.env("SSL_CERT_FILE", lab.path(name)).output().await.unwrap();
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{text}");
+        let named = text.contains("SSL_CERT_FILE names") && text.contains(name);
+        assert!(named && text.contains(why), "{text}");
+    }
     // A redirection to another place would lose the token.
     let moved = redirecting_server("https://lab.example/sci/v1/jobs");
     let refused = lab.refused(2, &["ls", "--url", &moved]).await;
@@ -524,7 +531,7 @@ async fn a_manifest_repeats_a_job_and_names_what_is_missing() {
     let (other, _) = done(&lab, &other).await;
     let different = lab.refused(1, &["watch", &other, "--manifest", manifest]).await;
     assert!(different.contains("different from the manifest"), "{different}");
-    assert!(different.contains("requests.job.tile.size is 32"), "{different}");
+    assert!(different.contains("request.tile.size is 32"), "{different}");
 
     // Another service has none of the inputs.
     let app = TestApp::with(&["--workers", "1"]).await;

@@ -105,6 +105,11 @@ async fn a_damaged_result_is_not_served_and_is_computed_again() {
     app.get(&format!("/view/jobs/{job}/snapshots/0/pictures/frame-1"))
         .await
         .problem(500, "file_damaged");
+    let mut fetch = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    fetch.args(["fetch", &job, "--url", &format!("http://{}", app.address()), "--out"]);
+    let output = fetch.arg(app.data().join("fetched")).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(!output.status.success() && text.contains(&detail), "{text}");
     // Intact files are served, and a client with the right bytes gets 304.
     app.get(&format!("/v1/jobs/{job}/snapshots/0/exports/frames/1.png")).await.expect(200);
     app.get(&format!("/v1/jobs/{job}/snapshots/1/exports/npy")).await.expect(200);

@@ -38,6 +38,7 @@ async fn with_library(body: &str, stall_seconds: &str) -> (tempfile::TempDir, Te
     let library = library(folder.path(), body);
     let library = library.to_str().unwrap();
     let arguments = ["--workers", "1", "--stall-seconds", stall_seconds, "--onnxruntime", library];
+    let arguments = [&arguments[..], &["--check-seconds", "8"]].concat();
     (folder, TestApp::with(&arguments).await)
 }
 
@@ -77,22 +78,32 @@ async fn a_task_that_kills_its_workers_is_abandoned() {
 }
 
 #[tokio::test]
-async fn a_hanging_network_delays_no_other_check_and_is_abandoned() {
+async fn hanging_networks_delay_no_other_work_and_are_refused() {
     let (_folder, app) = with_library("for (;;) pause();", "1").await;
-    let (calibration, _) = app.scene(&Scene::SMALL).await;
-    let file = app.upload(b"a network".to_vec()).await;
-    let body = json!({"calibration": calibration, "file": file});
-    let hanging = app.post("/v1/models", &body);
+    let (calibration, measurement) = app.scene(&Scene::SMALL).await;
+    let model = async |content: &[u8]| {
+        let file = app.upload(content.to_vec()).await;
+        app.post("/v1/models", &json!({"calibration": calibration, "file": file})).await
+    };
+    let hanging = async {
+        let refused = tokio::join!(model(b"one"), model(b"two"));
+        (refused, Instant::now())
+    };
     let others = async {
         tokio::time::sleep(Duration::from_secs(1)).await;
         let masks = app.upload(Scene::SMALL.masks()).await;
         app.post("/v1/calibrations", &json!({"masks": masks})).await.expect(201);
+        app.measure(&calibration, Scene::SMALL.snapshots()).await.expect(201);
+        let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+        assert_eq!(app.ended(&job).await["state"], "succeeded");
         Instant::now()
     };
-    let ((refused, end), checked) = tokio::join!(async { (hanging.await, Instant::now()) }, others);
-    assert!(checked < end, "it waited for the network");
-    let detail = refused.problem(500, "internal");
-    assert!(detail.contains("no progress"), "{detail}");
+    let (((one, two), end), done) = tokio::join!(hanging, others);
+    assert!(done < end, "other work waited for a network");
+    for refused in [one, two] {
+        let detail = refused.problem(422, "invalid_content");
+        assert!(detail.contains("one run of the network takes more than"), "{detail}");
+    }
     assert_eq!(app.get("/v1/models").await.json()["items"], json!([]));
 }
 

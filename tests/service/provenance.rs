@@ -40,8 +40,9 @@ async fn manifests_record_all_inputs_and_the_service_keeps_them() {
     let mut expected = json!({
         "masks_sha256": masks,
         "masks_axes": axes,
-        "measurement_sha256": data,
+        "calibration": {"masks": masks},
         "measurement_axes": axes,
+        "measurement": {"data": data},
     });
     assert_eq!(inputs(&app, &measurement).await.0, expected);
 
@@ -63,16 +64,10 @@ async fn manifests_record_all_inputs_and_the_service_keeps_them() {
     .await;
     let shown = app.get(&format!("/v1/calibrations/{calibration}")).await.expect(200).json();
     assert_eq!(shown["bad_pixels"], *bad, "{shown:#}");
-    for (name, value) in [
-        ("masks_crop", crop.clone()),
-        ("masks_frames", json!([0, 2])),
-        ("bad_pixels_sha256", json!(bad)),
-        ("measurement_crop", crop),
-        ("dark_sha256", json!(dark)),
-        ("saturation", json!(60000)),
-    ] {
-        expected[name] = value;
-    }
+    expected["calibration"] =
+        json!({"masks": masks, "crop": crop, "frames": [0, 2], "bad_pixels": bad});
+    expected["measurement"] =
+        json!({"data": data, "crop": crop, "dark": dark, "saturation": 60000});
     let (recorded, job) = inputs(&app, &measurement).await;
     assert_eq!(recorded, expected);
 

@@ -149,6 +149,49 @@ async fn moved_masks_are_corrected_and_reported() {
 }
 
 #[tokio::test]
+async fn the_command_moves_masks_with_bad_pixels_as_a_job_does() {
+    let Scene { height, width, .. } = SCENE;
+    let is_bad = |at: usize| {
+        let (row, column) = (at / width, at % width);
+        (30..50).contains(&row) && (40..60).contains(&column) || at % 211 == 7
+    };
+    let map = npy(&[height, width], (0..height * width).map(|at| f32::from(u8::from(is_bad(at)))));
+    let files = [("m.npy", masks(SCENE)), ("y.npy", snapshot(SCENE, SHIFTED)), ("bad.npy", map)];
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let mut uploads = Vec::new();
+    for (name, bytes) in files {
+        std::fs::write(folder.path().join(name), &bytes).unwrap();
+        uploads.push(app.upload(bytes).await);
+    }
+    let body = json!({"masks": uploads[0], "bad_pixels": uploads[2]});
+    let calibration = id(&app.post("/v1/calibrations", &body).await.expect(201));
+    let body = json!({"calibration": calibration, "data": uploads[1]});
+    let measurement = id(&app.post("/v1/measurements", &body).await.expect(201));
+    let (job, expected) = run(&app, &measurement, &json!({"shift": [1.5, 0.75]})).await;
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"))
+        .args(["reconstruct", "--masks", "m.npy", "--measurement", "y.npy", "--out", "out"])
+        .args(["--bad-pixels", "bad.npy", "--algorithm", "gap-tv", "--tile", "72"])
+        .args(["--overlap", "16", "--registration", "1.5,0.75", "--threads", "1"])
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!([Some(0), Some(3)].contains(&output.status.code()), "{text}");
+    let manifest = std::fs::read(folder.path().join("out/manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_slice(&manifest).unwrap();
+    let path = format!("/v1/jobs/{}/snapshots/0/exports/manifest", job["id"].as_str().unwrap());
+    let recorded = app.get(&path).await.expect(200).json();
+    for part in ["scale", "inputs", "registration"] {
+        assert_eq!(manifest["content"][part], recorded["content"][part], "{part}");
+    }
+    let frames = values(&std::fs::read(folder.path().join("out/frames.npy")).unwrap());
+    let pairs = frames.iter().zip(values(&expected));
+    let largest = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(largest < 1e-4, "the frames differ by {largest}");
+}
+
+#[tokio::test]
 async fn masks_that_have_turned_and_grown_are_corrected() {
     const WIDE: Scene = Scene { frames: 4, height: 184, width: 180, snapshots: 1 };
     let motion = Motion { shift: [0.75, -0.5], rotation: 0.12, scale: 1.001 };
@@ -237,6 +280,13 @@ async fn corrected_masks_become_a_calibration() {
     }
     let body = json!({"registration_of": auto["id"], "full_scale": 255});
     app.post("/v1/calibrations", &body).await.problem(422, "invalid_request");
+    // The job can't be deleted while the calibration is not made.
+    let pending = "UPDATE requests SET prepared = NULL, facts = NULL WHERE id = ?";
+    let mut database = app.database().await;
+    sqlx::query(pending).bind(saved).execute(&mut database).await.unwrap();
+    let job = format!("/v1/jobs/{}", auto["id"].as_str().unwrap());
+    let detail = app.delete(&job).await.problem(409, "in_use");
+    assert!(detail.contains(saved), "{detail}");
     app.sign_in(&app.token(&["create", "--lab", "another"]));
     let unknown = save(&auto).await;
     unknown.problem(422, "invalid_request");

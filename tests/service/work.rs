@@ -33,7 +33,7 @@ async fn the_manifest_is_complete_and_the_command_line_reproduces_the_frames() {
     let snapshot = format!("/v1/jobs/{job}/snapshots/1");
     let manifest = app.get(&format!("{snapshot}/exports/manifest")).await.expect(200).json();
     let content = &manifest["content"];
-    assert_eq!(content["inputs"]["measurement_sha256"], data);
+    assert_eq!(content["inputs"]["measurement"]["data"], data);
     assert_eq!(content["inputs"]["measurement_axes"], "frame-row-column");
     assert_eq!(content["models"], json!([]), "total variation has no network");
     assert_eq!(content["summary"]["tv_iterations"], 60);

@@ -99,6 +99,56 @@ fn the_right_input_has_a_figure_and_no_finding_on_the_masks() {
     assert_eq!(assessment["order"], "consistent");
 }
 
+/// Areas of a picture by row and column: a square, one half, a frame, stripes.
+const AREAS: [fn(usize, usize) -> bool; 4] = [
+    |row, column| (40..104).contains(&row) && (40..104).contains(&column),
+    |_, column| column < SIDE / 2,
+    |row, column| row.min(column) < 28 || row.max(column) >= SIDE - 28,
+    |_, column| column / 12 % 2 == 0,
+];
+
+#[tokio::test]
+async fn large_areas_that_are_not_measured_cause_no_finding_and_hide_none() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (masks, y) = scene();
+    for (which, is_hidden) in AREAS.into_iter().enumerate() {
+        let hidden = |at: usize| is_hidden(at % PIXELS / SIDE, at % SIDE);
+        let with = |values: &[f32], unknown: f32| -> Vec<f32> {
+            let value = |(at, value): (usize, &f32)| if hidden(at) { unknown } else { *value };
+            values.iter().enumerate().map(value).collect()
+        };
+        let unknown = with(&masks, f32::NAN);
+        // The sensor has values that mean nothing in the area.
+        let noise = |at: usize| if at * 7919 % 13 < 6 { 3.0 } else { 0.1 };
+        let broken: Vec<f32> =
+            y.iter().enumerate().map(|(at, y)| if hidden(at) { noise(at) } else { *y }).collect();
+        let marked = ["bad_pixels"];
+        assert_eq!(reconstruct(&unknown, &broken).1, marked, "area {which}");
+        assert_eq!(reconstruct(&masks, &with(&y, f32::NAN)).1, marked, "area {which}");
+        let dark = with(&masks, 0.0);
+        assert_eq!(reconstruct(&dark, &snapshot(&dark)).1, [""; 0], "area {which}");
+        let inverted: Vec<f32> = unknown.iter().map(|mask| 1.0 - mask).collect();
+        let codes = reconstruct(&inverted, &broken).1;
+        assert_eq!(codes[0], "inverted_masks", "area {which}: {codes:?}");
+        let lifted: Vec<f32> = broken.iter().map(|y| y + 0.5).collect();
+        let codes = reconstruct(&unknown, &lifted).1;
+        assert!(codes.contains(&"no_dark".to_owned()), "area {which}: {codes:?}");
+
+        let map = (0..PIXELS).map(|at| f32::from(u8::from(hidden(at))));
+        let map = app.upload(npy(&[SIDE, SIDE], map)).await;
+        let file = app.upload(npy(&[FRAMES, SIDE, SIDE], masks.iter().copied())).await;
+        let body = json!({"masks": file, "bad_pixels": map});
+        let calibration = id(&app.post("/v1/calibrations", &body).await.expect(201));
+        let report = format!("/v1/calibrations/{calibration}/report");
+        let report = app.get_until(&report, 200).await.json();
+        assert_eq!(report["findings"], json!([]), "area {which}");
+        let made = app.measure(&calibration, npy(&[SIDE, SIDE], broken.into_iter())).await;
+        let warnings = made.expect(201).json()["warnings"].take();
+        let codes: Vec<_> = warnings.as_array().unwrap().iter().map(|one| &one["code"]).collect();
+        assert_eq!(codes, marked, "area {which}: {warnings:#}");
+    }
+}
+
 #[test]
 fn inverted_masks_are_named_first() {
     let (masks, y) = scene();

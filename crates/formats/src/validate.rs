@@ -12,11 +12,11 @@ const TOLERANCE: f32 = 1e-6;
 /// Statistics of masks on `[0,1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaskStatistics {
-    /// Number of pixels with a sum of squares of 0 over the masks, which can't be reconstructed.
+    /// Number of measured pixels with a sum of squares of 0 over the masks, which can't be reconstructed.
     pub dead_pixels: u64,
     /// Number of values below 0, for example from dark subtraction, that were set to 0.
     pub clipped_negative: u64,
-    /// Mean over all masks and pixels.
+    /// Mean over all masks and measured pixels.
     pub mean: f64,
 }
 
@@ -41,9 +41,9 @@ pub fn check_masks(
     mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<()>,
 ) -> Result<MaskStatistics> {
     let (info, scale) = (*reader.info(), full_scale.value());
-    // True where the square of a mask is above 0.
+    // True where the square of a mask is above 0, or unknown.
     let mut open = Array2::from_elem((info.height, info.width), false);
-    let (mut clipped_negative, mut sum) = (0, 0.0);
+    let (mut clipped_negative, mut sum, mut measured) = (0, 0.0, 0u64);
     let mut largest = Located { value: 0.0, frame: 0, row: 0, column: 0 };
     let (mut zero_frames, mut signs) = (Vec::new(), Signs::default());
     let mut frames = 0;
@@ -68,8 +68,11 @@ pub fn check_masks(
                 signs.add(*value);
                 // Values above 1 by more than rounding are refused at the end.
                 *value = scaled.clamp(0.0, 1.0);
-                *open |= *value * *value > 0.0;
-                sum += if value.is_nan() { 0.0 } else { f64::from(*value) };
+                *open |= value.is_nan() || *value * *value > 0.0;
+                if !value.is_nan() {
+                    sum += f64::from(*value);
+                    measured += 1;
+                }
             }
         }
         if frame_max == 0.0 {
@@ -96,7 +99,7 @@ pub fn check_masks(
         None => Ok(MaskStatistics {
             dead_pixels: open.iter().filter(|open| !**open).count() as u64,
             clipped_negative,
-            mean: sum / info.voxels() as f64,
+            mean: sum / measured.max(1) as f64,
         }),
     }
 }

@@ -1,5 +1,5 @@
 //! Computes masks from captures of a white board: averages of repeats, then Eq. 7 of the paper, or its four-image form
-//! with a separate dark for captures through the mask.
+//! with a separate dark for captures through the mask. Pixels that are known to be bad are NaN in all images.
 
 use ndarray::{Array2, ArrayView2, Zip};
 
@@ -25,7 +25,7 @@ pub struct Repeats {
 /// The average of the repeats of one capture. Values are as stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Average {
-    /// Mean \[H,W\].
+    /// Mean \[H,W\]; NaN at pixels that are left out.
     pub mean: Array2<f32>,
     /// Variance of the mean \[H,W\], from the scatter of the repeats; `None` for a single capture.
     pub variance: Option<Array2<f32>>,
@@ -49,6 +49,15 @@ impl Repeats {
         }
     }
 
+    /// Leaves out the pixels of a map \[H,W\] of this size: they are NaN in the average. A map of another size is ignored.
+    #[must_use]
+    pub fn without(mut self, bad: &Array2<bool>) -> Self {
+        if bad.dim() == self.sum.dim() {
+            self.sum.zip_mut_with(bad, |sum, bad| *sum = if *bad { f64::NAN } else { *sum });
+        }
+        self
+    }
+
     /// Adds a capture \[H,W\].
     ///
     /// Errors: [`OpticsError::Captures`] for another size, and for values that are not finite.
@@ -66,19 +75,23 @@ impl Repeats {
             )));
         }
         let saturation = self.saturation.unwrap_or(f32::INFINITY);
-        let mut total = 0.0;
+        let (mut total, mut known) = (0.0, 0u64);
         Zip::from(&mut self.sum)
             .and(&mut self.squares)
             .and(&mut self.saturated)
             .and(capture)
             .for_each(|sum, square, saturated, &value| {
+                if sum.is_nan() {
+                    return;
+                }
+                known += 1;
                 let wide = f64::from(value);
                 *sum += wide;
                 *square += wide * wide;
                 *saturated |= value >= saturation;
                 total += wide;
             });
-        self.means.push(total / capture.len() as f64);
+        self.means.push(total / known.max(1) as f64);
         Ok(())
     }
 
@@ -124,7 +137,7 @@ pub struct References {
 #[derive(Debug)]
 pub struct Calibrator {
     references: References,
-    /// `white - black`, or 0 where it is too small to divide by.
+    /// `white - black`, or 0 where it is too small to divide by; NaN at bad pixels.
     denominator: Array2<f32>,
     not_positive: u64,
     too_dark: u64,
@@ -133,7 +146,8 @@ pub struct Calibrator {
 /// A mask before normalisation to the largest value of all masks.
 #[derive(Debug)]
 pub struct RawMask {
-    /// `(M_k - black_with_mask) / (white - black)` \[H,W\], cut at 0; 0 where the denominator is too small.
+    /// `(M_k - black_with_mask) / (white - black)` \[H,W\], cut at 0; 0 where the denominator is too small, and
+    /// NaN at bad pixels.
     pub values: Array2<f32>,
     /// Largest value.
     pub largest: f32,
@@ -160,7 +174,7 @@ impl Calibrator {
         }
         let mut denominator = &references.white.mean - &references.black.mean;
         let mut positive: Vec<f32> = denominator.iter().copied().filter(|v| *v > 0.0).collect();
-        let not_positive = (denominator.len() - positive.len()) as u64;
+        let not_positive = denominator.iter().filter(|value| **value <= 0.0).count() as u64;
         if positive.is_empty() {
             return Err(OpticsError::Captures(
                 "white is nowhere brighter than black: check that they are not interchanged and that the light was on"
@@ -170,11 +184,11 @@ impl Calibrator {
         let middle = positive.len() / 2;
         let floor = *positive.select_nth_unstable_by(middle, f32::total_cmp).1 * MIN_DENOMINATOR;
         let too_dark = positive.iter().filter(|value| **value < floor).count() as u64;
-        denominator.mapv_inplace(|value| if value >= floor { value } else { 0.0 });
+        denominator.mapv_inplace(|value| if value < floor { 0.0 } else { value });
         Ok(Self { references, denominator, not_positive, too_dark })
     }
 
-    /// The illumination `white - black` \[H,W\]; 0 where it is too dark to divide by.
+    /// The illumination `white - black` \[H,W\]; 0 where it is too dark to divide by, and NaN at bad pixels.
     pub fn illumination(&self) -> ArrayView2<'_, f32> {
         self.denominator.view()
     }
@@ -220,8 +234,8 @@ impl Calibrator {
         let (mut total, mut noise, mut valid) = (0.0, 0.0, 0u64);
         for (place, value) in mask.values.indexed_iter_mut() {
             let denominator = self.denominator[place];
-            if denominator == 0.0 {
-                *value = 0.0;
+            if denominator == 0.0 || denominator.is_nan() {
+                *value = denominator;
                 continue;
             }
             *value /= denominator;

@@ -6,7 +6,7 @@ use super::{
     Average, Calibrator, Correlations, ExpectedOrder, Finding, FindingCode, MaskFigures, RawMask,
     Reordering, flatness, pattern_overlap, reordering,
 };
-use ndarray::ArrayView3;
+use ndarray::{ArrayView2, ArrayView3};
 use serde::{Deserialize, Serialize};
 
 /// Statistics of the captures of one pattern.
@@ -30,7 +30,7 @@ pub struct PatternFigures {
 impl PatternFigures {
     /// Statistics of a mask. `saturated` is the number of saturated pixels of its averaged capture.
     pub fn new(mask: &RawMask, saturated: Option<u64>, drift: f64) -> Self {
-        let pixels = mask.values.len().max(1) as f64;
+        let pixels = measured(mask.values.view()).count().max(1) as f64;
         Self {
             light: mask.mean,
             not_positive: mask.not_positive as f64 / pixels,
@@ -40,6 +40,11 @@ impl PatternFigures {
             drift,
         }
     }
+}
+
+/// Values of the pixels that were measured.
+fn measured(image: ArrayView2<'_, f32>) -> impl Iterator<Item = &f32> {
+    image.into_iter().filter(|value| !value.is_nan())
 }
 
 /// Statistics of all captures of a calibration. Levels are stored values.
@@ -67,9 +72,9 @@ impl CaptureFigures {
     /// Statistics of the reference images of a calibrator and of the patterns.
     pub fn new(calibrator: &Calibrator, patterns: Vec<PatternFigures>) -> Self {
         let references = calibrator.references();
-        let pixels = calibrator.illumination().len().max(1) as f64;
+        let pixels = measured(calibrator.illumination()).count().max(1) as f64;
         let mean = |image: &Average| {
-            image.mean.iter().map(|&value| f64::from(value)).sum::<f64>() / pixels
+            measured(image.mean.view()).map(|&value| f64::from(value)).sum::<f64>() / pixels
         };
         Self {
             patterns,
@@ -147,19 +152,26 @@ pub(super) fn mask_scale(largest: f32) -> Option<Finding> {
     })
 }
 
+/// Share of the pixels from which dark areas are reported.
+const MIN_DARK_AREA: f64 = 0.001;
+
 /// Pixels that are dark in every mask, and pixels that are open in every mask, if there are more of them than chance
 /// explains. Of independent masks that are half open, one pixel in 2^B is dark in all.
 fn defective_pixels(figures: &MaskFigures) -> Vec<Finding> {
     let mut findings = Vec::new();
-    let pixels = figures.gram.len().max(1) as f64;
-    let (dead, chance) = (figures.dead_pixels as f64 / pixels, figures.dead_by_chance);
-    if chance.is_exceeded_by(dead) {
+    let pixels = figures.measured_pixels.max(1) as f64;
+    let (area, chance) = (figures.dark_area as f64 / pixels, figures.dead_by_chance);
+    let dead = figures.dead_pixels as f64 / pixels;
+    if chance.is_exceeded_by(dead - area) || area > MIN_DARK_AREA {
         let detail = format!(
-            "{:.2} % of the pixels are dark in every mask and can't be reconstructed; {:.2} % are expected by chance",
+            "{:.2} % of the pixels are dark in every mask and can't be reconstructed; {:.2} % are expected by chance, and \
+             {:.2} % lie in dark areas",
             dead * 100.0,
-            chance.share * 100.0
+            chance.share * 100.0,
+            area * 100.0
         );
-        let grave = dead - chance.share > 0.05;
+        // A dark area, for example one that the light of the aperture does not reach, spoils no other pixel.
+        let grave = dead - area - chance.share > 0.05;
         findings.push(Finding::new(FindingCode::DeadPixels, detail).escalate_if(grave));
     }
     let (stuck, chance) = (figures.stuck_pixels as f64 / pixels, figures.stuck_by_chance);

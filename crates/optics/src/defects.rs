@@ -87,7 +87,9 @@ pub fn outliers(
     }
     let index = (sorted.len() - 1) * 99 / 100;
     let (_, &mut bright, _) = sorted.select_nth_unstable_by(index, f32::total_cmp);
-    let mean_light = light.iter().filter(|light| light.is_finite()).sum::<f32>() / y.len() as f32;
+    // Areas without masks, or where all masks are dark, do not lower the mean.
+    let lit = || light.iter().copied().filter(|light| *light > 0.0);
+    let mean_light = lit().sum::<f32>() / lit().count().max(1) as f32;
     if bright <= 0.0 || mean_light <= 0.0 {
         return Vec::new();
     }
@@ -167,7 +169,7 @@ fn dead_lines(
             let comparable =
                 own > MUCH_LIGHT * mean_light && near_light > ENOUGH_LIGHT * mean_light;
             let expected = own * near / near_light;
-            if comparable && expected > deficit {
+            if comparable && expected > deficit && !y[[row, column]].is_nan() {
                 compared += 1;
                 dead += usize::from(y[[row, column]] < TOO_DARK * expected);
             }
@@ -249,9 +251,11 @@ impl Defects {
     }
 }
 
-/// Share of saturated pixels from which there is a finding, and from which frames are wrong.
+/// Share of saturated pixels, and of outliers, from which there is a finding, and from which frames are wrong.
 const REPORTED_SHARE: f64 = 0.001;
 const GRAVE_SHARE: f64 = 0.2;
+/// Share of pixels marked as not measured from which frames are wrong: little is left to measure.
+const MAX_MISSING: f64 = 0.75;
 
 /// Reports the defects of a snapshot of `pixels` pixels.
 #[allow(clippy::cast_precision_loss)] // counts of pixels
@@ -283,7 +287,8 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
             parts.push(format!("{missing} pixels are marked as not measured"));
         }
         let detail = format!("{}. {LEFT_OUT}", parts.join(", and "));
-        let grave = share(missing + outliers) > GRAVE_SHARE;
+        // The user knows of the pixels that are marked. Frames follow the measurement where it is measured.
+        let grave = share(outliers) > GRAVE_SHARE || share(missing) > MAX_MISSING;
         findings.push(Finding::new(FindingCode::BadPixels, detail).escalate_if(grave));
     }
     findings

@@ -18,8 +18,16 @@ pub struct Displacement {
     pub explained: f64,
 }
 
+impl Displacement {
+    /// True if the masks stay where they are.
+    pub fn is_none(&self) -> bool {
+        (self.rows, self.columns) == (0, 0)
+    }
+}
+
 /// Compares the centre of a measurement \[H,W\] with the sum of its masks \[H,W\] at each displacement by up to `reach`
-/// pixels along each axis. `None` if no block of 8x8 pixels is left, or if one of the two has no fine structure.
+/// pixels along each axis. NaN in either were not measured and are left out. `None` if no block of 8x8 pixels is left, or
+/// if one of the two has no fine structure.
 pub fn displacement(
     light: ArrayView2<'_, f32>,
     y: ArrayView2<'_, f32>,
@@ -33,8 +41,16 @@ pub fn displacement(
     }
     let energy = |image: &Array2<f32>| image.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>();
     let at = |row: usize, column: usize| s![row..row + rows, column..column + columns];
-    let y = block_centred(y.slice(at(reach, reach)));
-    let norm = energy(&y) * energy(&block_centred(light.slice(at(reach, reach))));
+    let y = y.slice(at(reach, reach));
+    let known = y.mapv(|value| !value.is_nan());
+    let lit = light.iter().copied().filter(|light| !light.is_nan());
+    let (sum, count) = lit.fold((0.0, 0usize), |(sum, count), v| (sum + f64::from(v), count + 1));
+    // Masks that are not known have no fine structure, so they match nothing.
+    let mean = (sum / count.max(1) as f64) as f32;
+    let light = light.mapv(|light| if light.is_nan() { mean } else { light });
+    let fine = |image: ArrayView2<'_, f32>| block_centred(image, known.view()).1;
+    let y = fine(y);
+    let norm = energy(&y) * energy(&fine(light.slice(at(reach, reach))));
     if norm.is_nan() || norm <= 0.0 {
         return None;
     }

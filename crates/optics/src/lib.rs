@@ -46,6 +46,7 @@ pub use mask_values::Alteration;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
 pub use measurement_check::{
     BitUsage, MeasurementFigures, MeasurementStudy, PhaseDifference, REACH, judge_measurement,
+    with_means,
 };
 pub use mosaic::{MARGIN, Mosaic};
 pub use multiplex::{Draw, Multiplexing};

@@ -113,20 +113,21 @@ fn slope(strips: &[Strip], fit: &Fit, weights: &[Array1<f64>]) -> f64 {
     for (strip, weights) in strips.iter().zip(weights) {
         let count = strip.y_means.len();
         let predicted = fit.brightness.mapv(|value| value as f32).dot(&strip.masks);
-        // For each block and half: sums of p, y, pp and py.
-        let mut sums = vec![[[0.0_f64; 4]; 2]; count];
-        for (at, (p, y)) in predicted.iter().zip(&strip.y).enumerate() {
+        // For each block and half: sums of p, y, pp, py, and the number of pixels.
+        let mut sums = vec![[[0.0_f64; 5]; 2]; count];
+        let pixels = predicted.iter().zip(&strip.y).zip(&strip.known).enumerate();
+        for (at, ((p, y), _)) in pixels.filter(|(_, (_, known))| **known) {
             let (row, column) = (at / (BLOCK * count), at % (BLOCK * count));
             let (p, y) = (f64::from(*p), f64::from(*y));
             let half = &mut sums[column / BLOCK][(row + column) % 2];
-            for (sum, value) in half.iter_mut().zip([p, y, p * p, p * y]) {
+            for (sum, value) in half.iter_mut().zip([p, y, p * p, p * y, 1.0]) {
                 *sum += value;
             }
         }
-        for (block, halves) in sums.iter().enumerate() {
-            let pixels = (BLOCK * BLOCK / 2) as f64;
+        for (block, halves) in sums.iter().enumerate().filter(|(at, _)| strip.measured[*at] > 0.0) {
             let light = strip.mask_means.column(block).dot(&fit.brightness);
-            let estimate = halves.map(|[p, y, pp, py]| {
+            let estimate = halves.map(|[p, y, pp, py, pixels]| {
+                let pixels = pixels.max(1.0);
                 let energy = pp - p * p / pixels;
                 if energy > 0.0 { light * (py - p * y / pixels) / energy } else { 0.0 }
             });
@@ -160,13 +161,16 @@ fn plainest_blocks(strips: &[Strip], fit: &Fit) -> (f64, f64) {
         mask_energy += masks.map(|(mask, x)| x * x * energy(mask)).sum::<f64>();
         let predicted = fit.brightness.mapv(|value| value as f32).dot(&strip.masks);
         sum_energy += energy(predicted.view());
-        pixels += strip.y.len() as f64;
+        pixels += strip.measured.sum() * (BLOCK * BLOCK) as f64;
     }
     let energy_per_mask = mask_energy / pixels / fit.brightness.len().max(1) as f64;
     let mut residuals = Vec::new();
     for strip in strips {
         let squares = strip.squared_residuals(&fit.brightness);
         for (block, square) in squares.iter().enumerate() {
+            if strip.measured[block] == 0.0 {
+                continue;
+            }
             let light = strip.mask_means.column(block).dot(&fit.brightness);
             let factor = (strip.y_means[block] / light).max(0.1);
             residuals.push(square / (energy_per_mask * factor * factor).max(f64::MIN_POSITIVE));

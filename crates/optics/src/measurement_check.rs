@@ -6,16 +6,16 @@
 //! show whether the optics have moved since the calibration.
 //!
 //! Brightness and offset are estimated by iteratively reweighted least squares: textured blocks are fitted badly, and get
-//! little weight.
+//! little weight. Pixels that were not measured, NaN in the measurement or in a mask, are left out.
 
 use std::ops::{Range, RangeInclusive};
 
-use ndarray::{Array1, Array2, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use super::calibration_check::mask_scale;
 use super::distortion::{Distortion, Part, distortion};
 use super::mask_values::{Alteration, Observed, alteration};
-use super::measurement_fit::{BLOCK, Fit, Strip, block_centred, brightness_errors, reweighted};
+use super::measurement_fit::{BLOCK, Fit, Strip, brightness_errors, equal_weights, reweighted};
 use super::{Finding, FindingCode};
 
 /// Largest shift between masks and measurement that is searched, in pixels along each axis.
@@ -51,8 +51,9 @@ const NEGATIVE_SHARE: f64 = 0.05;
 const PLAUSIBLE_BRIGHTNESS: RangeInclusive<f64> = 0.12..=1.1;
 /// The brightest parts are the blocks from this quantile on.
 const BRIGHTEST: f64 = 0.99;
-/// Share of the mean light from which the brightness of a single block counts.
+/// Share of the mean light from which the brightness of a single block counts, and from which a block is not dark.
 const ENOUGH_LIGHT: f64 = 0.5;
+const MIN_LIGHT: f64 = 0.1;
 /// Inverted masks explain at least this share of the fine structure.
 const MIN_INVERTED: f64 = 0.05;
 /// Smallest negative brightness of all frames together, relative to the mean of the measurement. Behind inverted masks it
@@ -77,13 +78,12 @@ pub struct MeasurementStudy {
     parts: Vec<Correlated>,
     /// `sum y'(p)^2`.
     energy: f64,
+    /// Number of measured pixels.
     pixels: f64,
     /// The largest mask value.
     largest_mask: f32,
     /// True if all mask values are 0 or 1.
     is_binary: bool,
-    /// The block means of the measurement that are below 0.
-    negative_means: Vec<f32>,
     strips: Vec<Strip>,
 }
 
@@ -101,6 +101,8 @@ struct Correlated {
 /// Statistics of a measurement with respect to its masks. Values are shares of the measurement's full scale.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct MeasurementFigures {
+    /// Number of measured pixels.
+    pub pixels: f64,
     /// Mean of the measurement.
     pub mean: f64,
     /// Largest value of the masks.
@@ -185,12 +187,12 @@ impl MeasurementStudy {
             pixels: 0.0,
             largest_mask: 0.0,
             is_binary: true,
-            negative_means: Vec::new(),
             strips: Vec::new(),
         }
     }
 
-    /// Adds a window of the masks \[B,h,w\] and of the measurement \[h,w\] that begins at this row and column.
+    /// Adds a window of the masks \[B,h,w\] and of the measurement \[h,w\] that begins at this row and column. Both are NaN
+    /// where nothing was measured.
     ///
     /// The window starts at an even row and column. Its outer [`REACH`] pixels on each side are a margin in which only
     /// the masks are used. Windows too small for a block are ignored.
@@ -206,18 +208,31 @@ impl MeasurementStudy {
         if frames != self.frames || y.dim() != (height, width) || rows == 0 || columns == 0 {
             return;
         }
-        let inside = |row: usize, column: usize| s![row..row + rows, column..column + columns];
-        let y = y.slice(inside(REACH, REACH));
-        self.pixels += y.len() as f64;
-        self.largest_mask = masks.iter().copied().fold(self.largest_mask, f32::max);
-        self.is_binary &= masks.iter().all(|value| *value == 0.0 || *value == 1.0);
-        let means = y.exact_chunks((BLOCK, BLOCK)).into_iter().filter_map(|block| block.mean());
-        self.negative_means.extend(means.filter(|mean| *mean < 0.0));
-        for row in (0..rows).step_by(BLOCK) {
-            let strip = s![.., REACH + row..REACH + row + BLOCK, REACH..REACH + columns];
-            self.strips.push(Strip::new(masks.slice(strip), y.slice(s![row..row + BLOCK, ..])));
+        let inside = s![REACH..REACH + rows, REACH..REACH + columns];
+        let mut y = y.slice(inside).to_owned();
+        for mask in masks.outer_iter() {
+            y.zip_mut_with(&mask.slice(inside), |y, mask| {
+                if mask.is_nan() {
+                    *y = f32::NAN;
+                }
+            });
         }
-        let y = block_centred(y);
+        self.largest_mask = masks.iter().copied().fold(self.largest_mask, f32::max);
+        self.is_binary &= masks.iter().all(|mask| mask.is_nan() || *mask == 0.0 || *mask == 1.0);
+        let masks = with_means(masks);
+        let mut fine = Array2::zeros(y.dim());
+        for row in (0..rows).step_by(BLOCK) {
+            let place = s![.., REACH + row..REACH + row + BLOCK, REACH..REACH + columns];
+            let strip = Strip::new(masks.slice(place), y.slice(s![row..row + BLOCK, ..]));
+            if strip.measured.sum() == 0.0 {
+                continue;
+            }
+            let own = fine.slice_mut(s![row..row + BLOCK, ..]);
+            own.into_iter().zip(&strip.y).for_each(|(fine, y)| *fine = *y);
+            self.pixels += strip.measured.sum() * (BLOCK * BLOCK) as f64;
+            self.strips.push(strip);
+        }
+        let y = fine;
         for part_rows in parts(rows) {
             for part_columns in parts(columns) {
                 let y = y.slice(s![part_rows.clone(), part_columns.clone()]);
@@ -249,21 +264,20 @@ impl MeasurementStudy {
         }
     }
 
-    /// Returns the statistics; `None` if all windows were too small, the masks have no structure, or the measurement is 0.
+    /// Returns the statistics; `None` if all windows were too small or not measured, the masks have no structure, or the
+    /// measurement is 0.
     pub fn finish(self) -> Option<MeasurementFigures> {
         if self.pixels == 0.0 {
             return None;
         }
-        let equal_weights: Vec<Array1<f64>> =
-            self.strips.iter().map(|strip| Array1::ones(strip.y_means.len())).collect();
-        let fit = Fit::new(&self.strips, &equal_weights);
-        let mean = self.strips.iter().map(|strip| strip.y_means.sum()).sum::<f64>()
-            * (BLOCK * BLOCK) as f64
-            / self.pixels;
+        let fit = Fit::new(&self.strips, &equal_weights(&self.strips));
+        let blocks =
+            || self.strips.iter().flat_map(|strip| strip.y_means.iter().zip(&strip.measured));
+        let measured = self.pixels / (BLOCK * BLOCK) as f64;
+        let mean = blocks().map(|(mean, measured)| mean * measured).sum::<f64>() / measured;
         let limit = -NEGATIVE_SHARE * mean.abs();
-        let negative_blocks =
-            self.negative_means.iter().filter(|block| f64::from(**block) < limit).count();
-        let negative_area = (negative_blocks * BLOCK * BLOCK) as f64 / self.pixels;
+        let negative = blocks().filter(|(mean, _)| **mean < limit).map(|(_, measured)| measured);
+        let negative_area = negative.sum::<f64>() / measured;
         if self.energy <= self.pixels * (FLAT * mean).powi(2) {
             return (mean != 0.0).then(|| self.flat(mean, negative_area, fit.is_some()));
         }
@@ -307,6 +321,7 @@ impl MeasurementStudy {
         let (brightest, brightest_block) = brightest(&self.strips, weighted.offset);
         let uncertainty = brightness_errors(&self.strips, &weighted, &weights);
         Some(MeasurementFigures {
+            pixels: self.pixels,
             mean,
             largest_mask: self.largest_mask,
             negative_area,
@@ -336,6 +351,7 @@ impl MeasurementStudy {
         let explained = if masks_vary { 0.0 } else { 1.0 };
         let (brightest, brightest_block) = brightest(&self.strips, 0.0);
         MeasurementFigures {
+            pixels: self.pixels,
             mean,
             largest_mask: self.largest_mask,
             negative_area,
@@ -364,6 +380,20 @@ impl Drift {
     }
 }
 
+/// The masks \[B,h,w\] with the mean of each one in place of NaN. Masks that are shifted or resampled have such pixels beside
+/// measured ones.
+pub fn with_means(masks: ArrayView3<'_, f32>) -> Array3<f32> {
+    let mut masks = masks.to_owned();
+    masks.outer_iter_mut().for_each(|mut mask| {
+        let known = mask.iter().filter(|value| !value.is_nan());
+        let (sum, count) =
+            known.fold((0.0, 0usize), |(sum, count), v| (sum + f64::from(*v), count + 1));
+        let mean = (sum / count.max(1) as f64) as f32;
+        mask.mapv_inplace(|value| if value.is_nan() { mean } else { value });
+    });
+    masks
+}
+
 /// Light of the brightest blocks, and of the brightest one, without the offset, relative to that of a scene of 1. The
 /// second counts blocks with enough light of the masks only.
 fn brightest(strips: &[Strip], offset: f64) -> (f64, f64) {
@@ -371,17 +401,20 @@ fn brightest(strips: &[Strip], offset: f64) -> (f64, f64) {
         .iter()
         .flat_map(|strip| {
             let light = strip.mask_means.sum_axis(Axis(0));
-            strip.y_means.iter().copied().zip(light).collect::<Vec<_>>()
+            let blocks = strip.y_means.iter().copied().zip(light).zip(&strip.measured);
+            let measured = blocks.filter(|(_, measured)| **measured > 0.0);
+            measured.map(|(block, _)| block).collect::<Vec<_>>()
         })
         .collect();
-    let mean_light = blocks.iter().map(|(_, light)| light).sum::<f64>() / blocks.len() as f64;
+    let lit = || blocks.iter().map(|(_, light)| *light).filter(|light| *light > 0.0);
+    let mean_light = lit().sum::<f64>() / lit().count().max(1) as f64;
     let sorted = |min_light: f64| {
         let lit = blocks.iter().filter(|(_, light)| *light > min_light);
         let mut values: Vec<f64> = lit.map(|(y, light)| (y - offset) / light).collect();
         values.sort_by(f64::total_cmp);
         values
     };
-    let values = sorted(0.0);
+    let values = sorted(MIN_LIGHT * mean_light);
     let last = values.len().saturating_sub(1);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // below the number of blocks
     let index = (last as f64 * BRIGHTEST) as usize;
@@ -396,9 +429,12 @@ fn brightest(strips: &[Strip], offset: f64) -> (f64, f64) {
 /// sign changes from block to block. Stripes differ on both diagonals.
 fn local_phase_difference(strips: &[Strip], brightness: &Array1<f64>) -> PhaseDifference {
     // Residual phases of each block, relative to its mean. The masks explain the light of a block up to a factor.
-    let residuals = |strip: &Strip| -> Vec<[f64; 4]> {
+    let residuals = |strip: &Strip| -> Vec<Option<[f64; 4]>> {
         let blocks = strip.y_block_phases.iter().zip(&strip.y_means).enumerate();
         let residual = |(block, (phases, mean)): (usize, (&[f64; 4], &f64))| {
+            if strip.measured[block] == 0.0 {
+                return None;
+            }
             let light = strip.mask_means.column(block).dot(brightness);
             let factor = if light > 0.0 { mean / light } else { 0.0 };
             let mut rest = *phases;
@@ -407,7 +443,7 @@ fn local_phase_difference(strips: &[Strip], brightness: &Array1<f64>) -> PhaseDi
                     .zip(&mask[block])
                     .for_each(|(rest, mask)| *rest -= factor * x * mask);
             }
-            rest.map(|rest| if *mean > 0.0 { rest / mean } else { 0.0 })
+            Some(rest.map(|rest| if *mean > 0.0 { rest / mean } else { 0.0 }))
         };
         blocks.map(residual).collect()
     };
@@ -420,7 +456,8 @@ fn local_phase_difference(strips: &[Strip], brightness: &Array1<f64>) -> PhaseDi
         };
         let (mut sum, mut squares, mut green_sum, mut count) = (0.0, 0.0, 0.0, 0.0);
         for pair in strips.iter().flat_map(|strip| strip.windows(2)) {
-            let (one, next) = (parts(&pair[0]), parts(&pair[1]));
+            let [Some(one), Some(next)] = pair else { continue };
+            let (one, next) = (parts(one), parts(next));
             let product = one.0 * next.0 + one.1 * next.1;
             sum += product;
             squares += product * product;
@@ -444,15 +481,22 @@ fn local_phase_difference(strips: &[Strip], brightness: &Array1<f64>) -> PhaseDi
 /// strips: a mosaic has the same sign everywhere, whereas the texture of a scene changes sign.
 fn phase_difference(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> PhaseDifference {
     let count = strips.len() as f64;
+    let measured: Vec<f64> = strips.iter().map(|strip| strip.measured.sum()).collect();
+    let total: f64 = measured.iter().sum();
     let difference = |phase: usize| {
         let residual = |strip: &Strip| {
             let explained =
                 strip.mask_phases.iter().zip(brightness).map(|(mask, x)| mask[phase] * x);
             (strip.y_phases[phase] - explained.sum::<f64>()) / mean
         };
-        let average = strips.iter().map(residual).sum::<f64>() / count;
-        let scatter = strips.iter().map(|strip| (residual(strip) - average).powi(2)).sum::<f64>();
-        let error = (scatter / (count - 1.0).max(1.0) / count).sqrt();
+        let residuals: Vec<_> = strips.iter().map(residual).zip(&measured).collect();
+        let average =
+            residuals.iter().map(|(residual, weight)| residual * **weight).sum::<f64>() / total;
+        let scatter = residuals
+            .iter()
+            .map(|(residual, weight)| ((residual - average) * **weight).powi(2))
+            .sum::<f64>();
+        let error = (scatter * count / (count - 1.0).max(1.0)).sqrt() / total;
         PhaseDifference { amplitude: average.abs(), significance: average.abs() / error.max(1e-9) }
     };
     let differences = (0..4).map(difference);
@@ -803,7 +847,7 @@ mod tests {
 
     use super::{BitUsage, MeasurementStudy, judge_measurement};
     use crate::masks::turning_circle;
-    use crate::{measure, noisy, random_squares};
+    use crate::{iid_masks, measure, noisy, random_squares};
 
     /// A disc that moves over a textured background.
     fn scene(frames: usize, side: usize) -> Array3<f32> {
@@ -966,6 +1010,61 @@ mod tests {
             assert_eq!(codes(&half, &y), ["drifted_masks"], "seed {seed}");
             let copy = masks.index_axis(ndarray::Axis(0), 3).to_owned();
             assert_eq!(codes(&masks, &copy), ["binary_measurement"], "seed {seed}");
+        }
+    }
+
+    /// Areas of a picture that are not measured.
+    fn areas(side: usize) -> Vec<(&'static str, Array2<bool>)> {
+        let area = |is_in: &dyn Fn(usize, usize) -> bool| {
+            Array2::from_shape_fn((side, side), |(i, j)| is_in(i, j))
+        };
+        let middle = side / 4..3 * side / 4;
+        let random = iid_masks(1, side, side, 9).unwrap();
+        vec![
+            ("square", area(&|i, j| middle.contains(&i) && middle.contains(&j))),
+            ("half", area(&|_, j| j < side / 2)),
+            ("frame", area(&|i, j| i.min(j) < side / 5 || i.max(j) >= side - side / 5)),
+            ("stripes", area(&|_, j| j / 12 % 2 == 0)),
+            ("random", area(&|i, j| random[[0, i, j]] > 0.5 && (i + j) % 3 > 0)),
+        ]
+    }
+
+    #[test]
+    fn areas_that_are_not_measured_cause_no_finding_and_hide_none() {
+        let kinds =
+            [fine_masks(8, 144), random_squares(8, 144, 144, 2).unwrap().0, fine_masks(3, 144)];
+        for masks in kinds {
+            let frames = masks.dim().0;
+            let y = noisy(measure(masks.view(), scene(frames, 144).view()).unwrap(), 0.02, 1);
+            let y = y.unwrap();
+            for (name, area) in areas(144) {
+                let name = format!("{name} {frames}");
+                let hidden = |y: &Array2<f32>| {
+                    let mut y = y.clone();
+                    y.zip_mut_with(&area, |y, hidden| *y = if *hidden { f32::NAN } else { *y });
+                    y
+                };
+                let mut unknown = masks.clone();
+                for mut mask in unknown.outer_iter_mut() {
+                    mask.zip_mut_with(&area, |mask, hidden| {
+                        *mask = if *hidden { f32::NAN } else { *mask };
+                    });
+                }
+                let none: [&str; 0] = [];
+                assert_eq!(codes_without_dark(&masks, &hidden(&y)), none, "{name}");
+                assert_eq!(codes_without_dark(&unknown, &y), none, "{name}");
+                let lifted = &y + 0.3 * y.mean().unwrap();
+                let found = codes_without_dark(&unknown, &hidden(&lifted));
+                assert!(found.contains(&"no_dark"), "{name}: {found:?}");
+                assert_eq!(codes(&masks, &hidden(&(&y * 10.0))), ["level"], "{name}");
+                let inverted = masks.mapv(|mask| 1.0 - mask);
+                assert_eq!(codes(&inverted, &hidden(&y)), ["inverted_masks"], "{name}");
+                let (other, _) = random_squares(frames, 144, 144, 100).unwrap();
+                assert_eq!(codes(&other, &hidden(&y)), ["foreign_masks"], "{name}");
+                let moved = hidden(&y).slice(s![2.., 1..]).to_owned();
+                let window = masks.slice(s![.., ..142, ..143]).to_owned();
+                assert_eq!(codes(&window, &moved), ["shifted_masks"], "{name}");
+            }
         }
     }
 

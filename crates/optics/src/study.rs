@@ -1,6 +1,8 @@
 //! Statistics of masks: the figures of a calibration report.
+//!
+//! They leave out pixels that were not measured, NaN in any mask, and dark areas: those outside the light of the aperture.
 
-use ndarray::{Array2, ArrayView3, Axis, s};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView3, Axis, s};
 
 use super::{OpticsError, Result};
 
@@ -8,6 +10,10 @@ use super::{OpticsError, Result};
 const BINS: usize = 4096;
 /// A pixel is stuck if it exceeds this value in every mask.
 const STUCK_PIXEL: f32 = 0.95;
+
+/// A pixel that is dark in every mask lies in a dark area if this share of its 3x3 neighbourhood is dark too: at a straight
+/// border it is two thirds.
+const DARK_AREA: f64 = 0.6;
 
 /// Accumulates the statistics of masks band by band, so that they need not fit in memory at once.
 #[derive(Debug)]
@@ -17,8 +23,8 @@ pub struct MaskStudy {
     products: Array2<f64>,
     /// Sum of each mask \[B\].
     sums: Vec<f64>,
-    /// For each mask, the sum over its rows of the squared row sum \[B\].
-    squared_row_sums: Vec<f64>,
+    /// Squared row sums of each mask \[B,H\].
+    squared_row_sums: Array2<f64>,
     /// Column sums of each mask \[B,W\].
     column_sums: Array2<f64>,
     mean: Array2<f32>,
@@ -71,14 +77,18 @@ pub struct MaskFigures {
     pub variance_between_rows: f64,
     /// Share of the masks' variance that is between columns; 1 if all pixels of a column are equal.
     pub variance_between_columns: f64,
-    /// Mean of each pixel over the masks \[H,W\].
+    /// Mean of each pixel over the masks \[H,W\]; NaN where nothing was measured, as in the other maps.
     pub mean: Array2<f32>,
     /// Standard deviation of each pixel over the masks \[H,W\].
     pub deviation: Array2<f32>,
     /// Sum of squares of each pixel over the masks \[H,W\]: the Gram diagonal.
     pub gram: Array2<f32>,
+    /// Number of pixels that were measured in all masks.
+    pub measured_pixels: u64,
     /// Number of pixels that are dark in every mask, and so can't be reconstructed.
     pub dead_pixels: u64,
+    /// Number of these in dark areas.
+    pub dark_area: u64,
     /// Number of pixels that are open in every mask, and so do not follow the patterns.
     pub stuck_pixels: u64,
     /// The share of pixels that are dark in every mask by chance.
@@ -110,10 +120,11 @@ impl MaskFigures {
         self.frame_means.iter().sum::<f64>() / self.frame_means.len().max(1) as f64
     }
 
-    /// Standard deviation over the masks, averaged over all pixels.
+    /// Standard deviation over the masks, averaged over the pixels.
     pub fn mean_deviation(&self) -> f64 {
-        self.deviation.iter().map(|&value| f64::from(value)).sum::<f64>()
-            / self.deviation.len().max(1) as f64
+        let measured = self.deviation.iter().filter(|value| !value.is_nan());
+        let sum = measured.map(|&value| f64::from(value)).sum::<f64>();
+        sum / (self.measured_pixels - self.dark_area).max(1) as f64
     }
 
     /// Correlations between pairs of masks; `None` for a single mask.
@@ -133,7 +144,7 @@ impl MaskStudy {
             next_row: 0,
             products: Array2::zeros((frames, frames)),
             sums: vec![0.0; frames],
-            squared_row_sums: vec![0.0; frames],
+            squared_row_sums: Array2::zeros((frames, height)),
             column_sums: Array2::zeros((frames, width)),
             mean: map(),
             deviation: map(),
@@ -161,30 +172,34 @@ impl MaskStudy {
         }
         for row in 0..rows {
             let line = band.slice(s![.., row, ..]);
+            let known: Vec<bool> =
+                line.columns().into_iter().map(|pixel| !pixel.iter().any(|v| v.is_nan())).collect();
+            let mut line = line.to_owned();
+            for (mut pixel, _) in
+                line.columns_mut().into_iter().zip(&known).filter(|(_, known)| !**known)
+            {
+                pixel.fill(0.0);
+            }
             // Within a row sums are f32, across rows f64.
             self.products += &line.dot(&line.t()).mapv(f64::from);
             for (frame, mask) in line.outer_iter().enumerate() {
                 let sum = f64::from(mask.sum());
                 self.sums[frame] += sum;
-                self.squared_row_sums[frame] += sum * sum;
-                self.counts[frame].add(mask);
+                self.squared_row_sums[(frame, self.next_row + row)] = sum * sum;
+                self.counts[frame].add(mask, &known);
             }
             ndarray::azip!((sum in &mut self.column_sums, &value in &line) *sum += f64::from(value));
-            for &value in line {
-                self.values_at_zero += u64::from(value <= 0.0);
-                self.histogram[bin(value)] += 1;
-            }
-            for column in 0..width {
-                self.add_pixel((self.next_row + row, column), line.column(column));
+            for (column, (pixel, known)) in line.columns().into_iter().zip(known).enumerate() {
+                self.add_pixel((self.next_row + row, column), known.then_some(pixel));
             }
         }
         self.next_row += rows;
         Ok(())
     }
 
-    /// The share of pixels that have a property in every mask by chance, from the share in each mask.
-    fn chance(&self, count: impl Fn(&PixelCounts) -> u64) -> Chance {
-        let pixels = self.mean.len() as f64;
+    /// The share of pixels that have a property in every mask by chance, from the numbers of pixels that have it in each
+    /// mask. There are `pixels` in all.
+    fn chance(&self, pixels: f64, count: impl Fn(&PixelCounts) -> u64) -> Chance {
         let share: f64 = self.counts.iter().map(|counts| count(counts) as f64 / pixels).product();
         // Random squares of side s have 2 p (1 - p) / s edges per pixel, where a share p is bright.
         let (mut edges, mut expected) = (0.0, 0.0);
@@ -198,7 +213,16 @@ impl MaskStudy {
         Chance { share, deviation: (share * (1.0 - share) / squares).sqrt() }
     }
 
-    fn add_pixel(&mut self, at: (usize, usize), values: ndarray::ArrayView1<'_, f32>) {
+    /// Adds a pixel, which is `None` if it was not measured.
+    fn add_pixel(&mut self, at: (usize, usize), values: Option<ArrayView1<'_, f32>>) {
+        let Some(values) = values else {
+            (self.mean[at], self.gram[at], self.deviation[at]) = (f32::NAN, f32::NAN, f32::NAN);
+            return;
+        };
+        for &value in values {
+            self.values_at_zero += u64::from(value <= 0.0);
+            self.histogram[bin(value)] += 1;
+        }
         let count = values.len() as f32;
         let mean = values.sum() / count;
         let gram: f32 = values.iter().map(|value| value * value).sum();
@@ -212,15 +236,30 @@ impl MaskStudy {
     /// Returns the statistics.
     ///
     /// Errors: [`OpticsError::Pattern`] if rows are missing.
-    pub fn finish(self) -> Result<MaskFigures> {
-        let (height, width) = self.mean.dim();
+    pub fn finish(mut self) -> Result<MaskFigures> {
+        let height = self.mean.nrows();
         if self.next_row != height {
             return Err(OpticsError::Pattern(format!(
                 "the masks are incomplete: {} of {height} rows were added",
                 self.next_row
             )));
         }
-        let pixels = (height * width) as f64;
+        let measured_pixels = self.gram.iter().filter(|gram| !gram.is_nan()).count() as u64;
+        let dead_pixels = self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64;
+        let measured = (measured_pixels as f64).max(1.0);
+        let by_chance = self.chance(measured, |counts| counts.closed);
+        // Few independent masks of large squares are dark in some areas by chance.
+        let is_dark = match by_chance.is_exceeded_by(dead_pixels as f64 / measured) {
+            true => dark_areas(&self.gram),
+            false => Array2::from_elem(self.gram.dim(), false),
+        };
+        let dark_area = is_dark.iter().filter(|dark| **dark).count() as u64;
+        // Dark areas add nothing to a sum, so only the numbers of pixels change.
+        let counted = ndarray::Zip::from(&self.gram)
+            .and(&is_dark)
+            .map_collect(|gram, dark| f64::from(u8::from(!gram.is_nan() && !dark)));
+        let pixels = ((measured_pixels - dark_area) as f64).max(1.0);
+        self.histogram[0] -= dark_area * self.sums.len() as u64;
         let covariance = |k: usize, l: usize| {
             self.products[[k, l]] / pixels - self.sums[k] * self.sums[l] / (pixels * pixels)
         };
@@ -229,13 +268,18 @@ impl MaskStudy {
             if norm > 0.0 { (covariance(k, l) / norm).clamp(-1.0, 1.0) } else { 0.0 }
         });
         let squared_mean = |sum: f64| sum * sum / (pixels * pixels);
+        // Mean square over the pixels of the means of their lines.
+        let between = |squared_sums: ArrayView1<'_, f64>, counts: &Array1<f64>| {
+            let lines = squared_sums.into_iter().zip(counts).filter(|(_, count)| **count > 0.0);
+            lines.map(|(sum, count)| sum / count).sum::<f64>() / pixels
+        };
+        let (row_counts, column_counts) = (counted.sum_axis(Axis(1)), counted.sum_axis(Axis(0)));
+        let squared_column_sums = self.column_sums.mapv(|sum| sum * sum);
         let (mut total, mut rows, mut columns) = (0.0, 0.0, 0.0);
         for (k, &sum) in self.sums.iter().enumerate() {
-            let squared_column_sums =
-                self.column_sums.row(k).iter().map(|sum| sum * sum).sum::<f64>();
             total += covariance(k, k);
-            rows += self.squared_row_sums[k] / (width * width * height) as f64 - squared_mean(sum);
-            columns += squared_column_sums / (height * height * width) as f64 - squared_mean(sum);
+            rows += between(self.squared_row_sums.row(k), &row_counts) - squared_mean(sum);
+            columns += between(squared_column_sums.row(k), &column_counts) - squared_mean(sum);
         }
         let share = |part: f64| if total > 0.0 { (part / total).clamp(0.0, 1.0) } else { 0.0 };
         Ok(MaskFigures {
@@ -243,10 +287,12 @@ impl MaskStudy {
             variance_between_columns: share(columns),
             frame_means: self.sums.iter().map(|sum| sum / pixels).collect(),
             correlation,
-            dead_pixels: self.gram.iter().filter(|gram| **gram <= 0.0).count() as u64,
+            measured_pixels,
+            dark_area,
+            dead_pixels,
             stuck_pixels: self.stuck_pixels,
-            dead_by_chance: self.chance(|counts| counts.closed),
-            stuck_by_chance: self.chance(|counts| counts.open),
+            dead_by_chance: self.chance(pixels, |counts| counts.closed - dark_area),
+            stuck_by_chance: self.chance(pixels, |counts| counts.open),
             values_at_zero: self.values_at_zero,
             largest: percentile(&self.histogram, 1.0),
             percentile_1: percentile(&self.histogram, 0.01),
@@ -259,10 +305,14 @@ impl MaskStudy {
 }
 
 impl PixelCounts {
-    /// Adds a row of a mask.
-    fn add(&mut self, row: ndarray::ArrayView1<'_, f32>) {
+    /// Adds a row of a mask, without the pixels that are not known.
+    fn add(&mut self, row: ArrayView1<'_, f32>, known: &[bool]) {
         let mut previous = None;
-        for &value in row {
+        for (&value, known) in row.iter().zip(known) {
+            if !known {
+                previous = None;
+                continue;
+            }
             let bright = value > 0.5;
             self.closed += u64::from(value <= 0.0);
             self.open += u64::from(value > STUCK_PIXEL);
@@ -271,6 +321,21 @@ impl PixelCounts {
             previous = Some(bright);
         }
     }
+}
+
+/// True for pixels in dark areas, from the Gram diagonal \[H,W\].
+fn dark_areas(gram: &Array2<f32>) -> Array2<bool> {
+    let (height, width) = gram.dim();
+    let around = |at: usize, length: usize| at.saturating_sub(1)..length.min(at + 2);
+    Array2::from_shape_fn((height, width), |(row, column)| {
+        if gram[(row, column)] != 0.0 {
+            return false;
+        }
+        let neighbours = gram.slice(s![around(row, height), around(column, width)]);
+        let known = neighbours.iter().filter(|gram| !gram.is_nan()).count();
+        let dark = neighbours.iter().filter(|gram| **gram == 0.0).count();
+        dark > 1 && dark as f64 >= DARK_AREA * known as f64
+    })
 }
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)] // clamped to the bins
@@ -344,6 +409,45 @@ mod tests {
         let expected = (&a * &b).sum() / ((&a * &a).sum() * (&b * &b).sum()).sqrt();
         assert!((figures.correlation[[1, 4]] - f64::from(expected)).abs() < 1e-4);
         assert!(figures.percentile_1 < 0.2 && figures.percentile_99 > 0.8);
+    }
+
+    /// Areas that were not measured, or that no light reaches, change no statistic of the others.
+    #[test]
+    fn areas_without_values_are_left_out() {
+        let (masks, _) = random_squares(6, 80, 60, 2).unwrap();
+        let figures = |masks: &Array3<f32>| {
+            let (frames, height, width) = masks.dim();
+            let mut study = MaskStudy::new(frames, height, width);
+            for band in masks.axis_chunks_iter(Axis(1), 7) {
+                study.add(band).unwrap();
+            }
+            study.finish().unwrap()
+        };
+        let expected = figures(&masks.slice(s![.., .., 30..]).to_owned());
+        for value in [f32::NAN, 0.0] {
+            let mut part = masks.clone();
+            part.slice_mut(s![.., .., ..30]).fill(value);
+            let found = figures(&part);
+            let pairs = [
+                (found.overall_mean(), expected.overall_mean()),
+                (found.mean_deviation(), expected.mean_deviation()),
+                (found.correlation[[1, 4]], expected.correlation[[1, 4]]),
+                (found.variance_between_rows, expected.variance_between_rows),
+                (found.variance_between_columns, expected.variance_between_columns),
+                (f64::from(found.percentile_1), f64::from(expected.percentile_1)),
+            ];
+            for (found, expected) in pairs {
+                assert!((found - expected).abs() < 1e-4, "{value}: {pairs:?}");
+            }
+            assert_eq!(found.dark_area, if value == 0.0 { 80 * 30 } else { 0 });
+            assert_eq!(found.dead_pixels - found.dark_area, expected.dead_pixels);
+            let grades: Vec<_> = crate::judge_masks(&found, None)
+                .into_iter()
+                .map(|finding| (finding.code.as_str(), finding.severity))
+                .collect();
+            let dark = ("dead_pixels", crate::Severity::Warning);
+            assert_eq!(grades, if value == 0.0 { vec![dark] } else { vec![] });
+        }
     }
 
     #[test]

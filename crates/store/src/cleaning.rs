@@ -139,8 +139,10 @@ impl Store {
                     // Before the disk is asked again.
                     self.removals.finished().await;
                 }
-                // The job was retried or deleted in between.
-                Err(StoreError::NotFinal(_) | StoreError::NotFound { .. }) => {}
+                // The job was retried or deleted in between, or its masks are being saved.
+                Err(
+                    StoreError::NotFinal(_) | StoreError::NotFound { .. } | StoreError::JobInUse(_),
+                ) => {}
                 Err(error) => return Err(error),
             }
         }

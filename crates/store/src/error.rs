@@ -76,6 +76,10 @@ pub enum StoreError {
     },
     #[error("the {what} is used by {users} {by}; delete those first")]
     InUse { what: &'static str, by: &'static str, users: u64 },
+    #[error(
+        "calibration {0} is being made from the job; wait until it is made, or delete it first"
+    )]
+    JobInUse(engine::job::CalibrationId),
     #[error("a calibration, a measurement or a model needs the file {0}; delete that first")]
     FileInUse(engine::job::Sha256),
     #[error("{0}")]

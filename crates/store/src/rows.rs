@@ -5,7 +5,7 @@ use sqlx::sqlite::SqliteRow;
 
 use super::error::{Result, StoreError};
 use crate::columns::{Columns, FromColumn, FromRow, sql, sql_as};
-use engine::job::{CalibrationId, Lab, MeasurementId, ModelId, Sha256, Timestamp};
+use engine::job::{CalibrationId, JobId, Lab, MeasurementId, ModelId, Sha256, Timestamp};
 
 /// One page of a list, and whether to go on after it.
 #[derive(Debug, Clone)]
@@ -69,6 +69,7 @@ pub(super) enum Reference {
     Calibration(CalibrationId),
     Measurement(MeasurementId),
     Model(ModelId),
+    Job(JobId),
 }
 
 const THING: &str = "SELECT 1 FROM requests WHERE id = ? AND facts IS NOT NULL";
@@ -85,6 +86,7 @@ pub(super) async fn require(
             Reference::Calibration(id) => ("calibration", THING, id.to_string()),
             Reference::Measurement(id) => ("measurement", THING, id.to_string()),
             Reference::Model(id) => ("model", THING, id.to_string()),
+            Reference::Job(id) => ("job", "SELECT 1 FROM jobs WHERE id = ?", id.to_string()),
         };
         let found = sql!(query, [id.as_str()]).fetch_optional(&mut *connection).await?;
         found.ok_or(StoreError::NotFound { what, id })?;

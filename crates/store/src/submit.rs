@@ -34,7 +34,7 @@ impl Store {
     /// Records a request for something that is made of uploads, and puts their check in the queue.
     /// Errors: [`StoreError::KeyReused`](crate::StoreError::KeyReused);
     /// [`StoreError::ManyChecks`](crate::StoreError::ManyChecks); [`StoreError::NotFound`](crate::StoreError::NotFound)
-    /// if an upload or the calibration was deleted.
+    /// if an upload, the calibration or the job was deleted.
     pub async fn request<Id>(
         &self,
         (lab, token): (&Lab, Option<TokenId>),

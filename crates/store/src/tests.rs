@@ -294,8 +294,14 @@ where
     Id: From<ThingId> + FromStr<Err = InvalidId>,
 {
     let local = engine::job::Lab::local();
+    let is_model = matches!(asked, Submission::Model(_));
     let made = store.request((&local, None), &new_request(asked), None).await.unwrap();
-    let task = store.claim(worker, LEASE).await.unwrap().unwrap();
+    let (claimant, other) = match is_model {
+        true => (Claimant::Networks, Claimant::Light),
+        false => (Claimant::Local, Claimant::Networks),
+    };
+    assert!(store.claim_as(other, worker, LEASE).await.unwrap().is_none());
+    let task = store.claim_as(claimant, worker, LEASE).await.unwrap().unwrap();
     assert_eq!(task.kind, TaskKind::Check);
     assert_eq!(checked(store, &task, passed).await, Heartbeat::Continue);
     made.id()

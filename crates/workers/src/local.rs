@@ -411,12 +411,8 @@ fn recipe(task: &JobTask) -> Result<Recipe, PipelineError> {
 /// Collects the records of a job's other tasks for its manifest. `attempt` is the number of the manifest task's
 /// attempt.
 fn tasks(task: &JobTask, attempt: u32) -> Result<JobTasks, PipelineError> {
-    let mut tasks = JobTasks {
-        requests: task.repetition.clone().ok_or_else(|| missing_input(TaskKind::Manifest))?,
-        snapshots: Vec::new(),
-        seconds: Vec::new(),
-        attempts: u64::from(attempt),
-    };
+    let mut tasks =
+        JobTasks { snapshots: Vec::new(), seconds: Vec::new(), attempts: u64::from(attempt) };
     for task in &task.records {
         tasks.seconds.push((task.kind, task.seconds));
         tasks.attempts += u64::from(task.attempt);

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::model_process::ModelCommand;
 use super::transport::TaskError;
 use engine::intake::{IntakeError, Refusal, RefusalCode};
-use engine::job::{ModelFacts, ModelVerdict, without_paths};
+use engine::job::{ModelFacts, ModelVerdict, TaskStage, without_paths};
 use engine::pipeline::progress::Monitor;
 use store::NewCalibration;
 
@@ -105,7 +105,11 @@ fn run_until(
         let status = loop {
             match child.try_wait() {
                 Ok(None) if monitor.stopped() || Instant::now() >= deadline => break Ok(None),
-                Ok(None) => std::thread::sleep(POLL),
+                Ok(None) => {
+                    // The deadline bounds the run, so silence is no stall.
+                    monitor.reach(TaskStage::Reading, 0.0);
+                    std::thread::sleep(POLL);
+                }
                 ended => break ended,
             }
         };

@@ -79,7 +79,7 @@ impl<'a> Measured<'a> {
     }
 
     fn white(&self) -> Result<f32, CliError> {
-        white(self.masks.view(), self.measurement.view())
+        white(self.masks.sum_axis(Axis(0)), self.measurement.view())
             .map_err(|error| CliError::Input(format!("clip {}: {error}", self.clip)))
     }
 

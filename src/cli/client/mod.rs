@@ -14,7 +14,7 @@ use clap::Args;
 use rand::RngExt;
 use reqwest::header::LOCATION;
 use reqwest::redirect::Policy;
-use reqwest::{RequestBuilder, Response, StatusCode};
+use reqwest::{Method, Request, RequestBuilder, Response, StatusCode};
 use serde_json::Value;
 
 use super::CliError;
@@ -130,7 +130,7 @@ impl Client {
         Ok(Self { url, token, http, has_answered: Arc::default() })
     }
 
-    fn request(&self, method: reqwest::Method, path: &str) -> RequestBuilder {
+    fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let request = self.http.request(method, format!("{}{path}", self.url));
         match &self.token {
             Some(token) => request.bearer_auth(token),
@@ -142,16 +142,31 @@ impl Client {
     async fn send(&self, request: impl Fn() -> RequestBuilder) -> Result<Response> {
         let mut attempt = 0;
         loop {
-            let sent = request().send().await;
+            let next = built(request())?;
+            let is_head = next.method() == Method::HEAD;
+            let sent = self.http.execute(next).await;
             self.has_answered.fetch_or(sent.is_ok(), Ordering::Relaxed);
             let error = match sent {
                 Ok(response) if response.status().is_success() => return Ok(response),
                 Ok(response) if response.status().is_redirection() => self.moved(&response),
+                Ok(response) if is_head => self.reason(request(), response.status()).await?,
                 Ok(response) => refusal(response).await,
                 Err(error) => self.interruption(&error),
             };
             wait_to_retry(error, &mut attempt).await?;
         }
+    }
+
+    /// The reason why a HEAD request was refused. The answer has no body, so the request is repeated as GET. If that has
+    /// another answer, no reason is known.
+    async fn reason(&self, request: RequestBuilder, status: StatusCode) -> Result<ClientError> {
+        let mut request = built(request)?;
+        *request.method_mut() = Method::GET;
+        Ok(match self.http.execute(request).await {
+            Ok(response) if response.status() == status => refusal(response).await,
+            Ok(_) => refused(status, &Value::Null),
+            Err(error) => self.interruption(&error),
+        })
     }
 
     /// The error of a redirection, with the address to state instead.
@@ -189,7 +204,7 @@ impl Client {
     }
 
     pub(super) async fn get(&self, path: &str) -> Result<Value> {
-        self.json(|| self.request(reqwest::Method::GET, path)).await
+        self.json(|| self.request(Method::GET, path)).await
     }
 
     /// Gets a resource that may not exist.
@@ -204,16 +219,16 @@ impl Client {
     /// Gets a resource whose work may still run; the service answers at the end of the work, or after `wait` seconds.
     async fn get_ended(&self, path: &str, wait: u32) -> Result<Value> {
         let prefer = format!("wait={wait}");
-        self.json(|| self.request(reqwest::Method::GET, path).header("Prefer", &prefer)).await
+        self.json(|| self.request(Method::GET, path).header("Prefer", &prefer)).await
     }
 
     pub(super) async fn post(&self, path: &str, body: &Value) -> Result<Value> {
-        self.json(|| self.request(reqwest::Method::POST, path).json(body)).await
+        self.json(|| self.request(Method::POST, path).json(body)).await
     }
 
     /// Creates a resource. Repeated requests with the same key create it once.
     pub(super) async fn create(&self, path: &str, body: &Value, key: &str) -> Result<Value> {
-        let request = || self.request(reqwest::Method::POST, path).json(body);
+        let request = || self.request(Method::POST, path).json(body);
         self.json(|| request().header("Idempotency-Key", key)).await
     }
 }
@@ -235,6 +250,10 @@ async fn wait_to_retry(error: ClientError, attempt: &mut u32) -> Result<()> {
     let share = rand::rng().random_range(0.5..1.0);
     tokio::time::sleep(Duration::from_secs_f64(seconds * share)).await;
     Ok(())
+}
+
+fn built(request: RequestBuilder) -> Result<Request, CliError> {
+    request.build().map_err(|error| CliError::Failure(with_causes(&error)))
 }
 
 /// Reads the problem in an answer without success.

@@ -346,7 +346,7 @@ class Client:
         order. Raises `ValueError` with the hashes of those that are missing. `Job.differences` compares the frames.
         """
         whole = read_manifest(manifest)
-        requests, run = whole["content"]["requests"], whole["run"]
+        requests, run = whole["content"]["inputs"], whole["run"]
         held = {transfer.sha256(Path(file)): file for file in files}
         network = whole["content"]["models"][0]["sha256"] if run["model"] else None
         inputs = {"calibration": dict(hashes(requests["calibration"], "masks"))}
@@ -366,7 +366,7 @@ class Client:
                     missing.append(f"{role} with the SHA-256 {sha256}")
         if missing:
             raise ValueError(f"the service lacks inputs of the manifest: {'; '.join(missing)}. Add their files")
-        calibration, measurement, job = run["calibration"], run["measurement"], dict(requests["job"])
+        calibration, measurement, job = run["calibration"], run["measurement"], dict(whole["content"]["request"])
         if not ready["calibration"]:
             calibration = Calibration(self, self._create("calibrations", **requests["calibration"])).ready().id
         if not ready["measurement"]:
@@ -730,7 +730,7 @@ class Result:
 def read_manifest(manifest: Record | str | os.PathLike[str]) -> Record:
     """The manifest of a job. Raises `ValueError` for other files."""
     whole: Record = dict(manifest) if isinstance(manifest, Mapping) else json.loads(Path(manifest).read_bytes())
-    if whole.get("schema") != "sci-recon/job/1" or "requests" not in whole["content"]:
+    if whole.get("schema") != "sci-recon/job/1" or "request" not in whole["content"]:
         raise ValueError("this is not the manifest.json of a job, or an earlier version has written it")
     return whole
 

@@ -59,7 +59,8 @@ pub struct Report {
 /// Computes masks \[B,H,W\] on \[0,1\] from captures, and reports on them.
 ///
 /// The masks' scale is known only after the last one, so they are first written to `scratch`, an existing file. Then
-/// the normalised masks go to the writer that `open` returns, with NaN where the map `bad` is not 0. Returns the report and
+/// the normalised masks go to the writer that `open` returns, with NaN where the map `bad` is not 0. No statistic of the
+/// report has these pixels. Returns the report and
 /// the output of the writer.
 ///
 /// Errors: unreadable or unusable captures or patterns; I/O; [`IntakeError::Stopped`]; those of `open`.
@@ -72,12 +73,18 @@ pub fn calibrate<W: Write>(
 ) -> Result<(Calibrated, W)> {
     // Patterns are checked before the averaging, which may take an hour.
     let patterns = read_patterns(files, limits)?;
-    let captured = average_masks(files, limits, scratch, progress)?;
+    let bad = match (bad, files.white.first()) {
+        (Some(bad), Some(white)) => {
+            let white = formats::open_stack(white, limits).map_err(IntakeError::format("white"))?;
+            let StackInfo { height, width, .. } = *white.info();
+            Some(bad_pixels(bad, (height, width), limits)?)
+        }
+        _ => None,
+    };
+    let captured = average_masks((files, bad.as_ref()), limits, scratch, progress)?;
     let raw = Reader::open(scratch, limits)?;
-    let size = (raw.info().height, raw.info().width);
-    let bad = bad.map(|bad| bad_pixels(bad, size, limits)).transpose()?;
     let to = open(raw.info())?;
-    let masks = write_scaled(&raw, captured.scale, bad.as_ref(), to, progress)?;
+    let masks = write_scaled(&raw, captured.scale, to, progress)?;
     let figures = study(&raw, captured.scale, progress)?;
     let findings = judge_masks(&figures, patterns.as_ref().map(|patterns| patterns.view()));
     let report = report_on(&figures, Some(&captured), findings)?;
@@ -148,15 +155,15 @@ struct Captured {
     /// Largest value of all masks before normalisation: the share of the white's light where a mask is 1.
     scale: f32,
     figures: CaptureFigures,
-    /// `white - black` \[H,W\].
+    /// `white - black` \[H,W\]; NaN at bad pixels.
     illumination: Array2<f32>,
     sample: SampleType,
     clipped_negatives: u64,
 }
 
-/// Averages captures frame by frame, and writes the masks \[B,H,W\] before normalisation to `raw`.
+/// Averages captures frame by frame without the pixels of a map, and writes the masks \[B,H,W\] before normalisation to `raw`.
 fn average_masks(
-    files: &CaptureFiles,
+    (files, bad): (&CaptureFiles, Option<&Array2<bool>>),
     limits: &Limits,
     raw: &Path,
     progress: &mut Progress<'_>,
@@ -168,7 +175,7 @@ fn average_masks(
         let place = |index| format!("captures of {name}, file {}", index + 1);
         let mut report = |share| progress(whole(share));
         let open = |path: &Path| formats::open_stack(path, limits);
-        let averaged = average(paths, files.saturation, open, place, &mut report);
+        let averaged = average((paths, bad), files.saturation, open, place, &mut report);
         done += 1;
         averaged
     };
@@ -208,9 +215,9 @@ fn average_masks(
     Ok(Captured { scale, figures, illumination, sample, clipped_negatives: clipped })
 }
 
-/// Averages all frames of some files, which `open` opens. `place` names a file in errors, by its index.
+/// Averages all frames of some files, which `open` opens, without the pixels of a map. `place` names a file in errors, by its index.
 pub(super) fn average(
-    paths: &[PathBuf],
+    (paths, bad): (&[PathBuf], Option<&Array2<bool>>),
     saturation: Option<u32>,
     open: impl Fn(&Path) -> Result<Box<dyn FrameReader + Send>, FormatError>,
     place: impl Fn(usize) -> String,
@@ -223,7 +230,13 @@ pub(super) fn average(
         let info = *reader.info();
         sample = info.sample;
         let level = saturation_level(&info, saturation);
-        let repeats = repeats.get_or_insert_with(|| Repeats::new(info.height, info.width, level));
+        let repeats = repeats.get_or_insert_with(|| {
+            let repeats = Repeats::new(info.height, info.width, level);
+            match bad {
+                Some(bad) => repeats.without(bad),
+                None => repeats,
+            }
+        });
         let mut frame = 0;
         while let Some(capture) = reader.next_frame().map_err(failed)? {
             let added = repeats.add(capture.view());
@@ -251,14 +264,13 @@ fn report_progress(progress: &mut Progress<'_>, share: f64) -> Result<()> {
 
 /// Divides masks by their largest value.
 fn normalise(masks: &mut Array3<f32>, scale: f32) {
-    masks.mapv_inplace(|value| (value / scale).min(1.0));
+    masks.mapv_inplace(|value| (value / scale).clamp(0.0, 1.0));
 }
 
-/// Writes the normalised masks, NaN at bad pixels \[H,W\].
+/// Writes the normalised masks.
 fn write_scaled<W: Write>(
     raw: &Reader,
     scale: f32,
-    bad: Option<&Array2<bool>>,
     mut to: StackWriter<W>,
     progress: &mut Progress<'_>,
 ) -> Result<W> {
@@ -266,14 +278,6 @@ fn write_scaled<W: Write>(
     for frame in 0..frames {
         let mut mask = raw.read_window(frame..frame + 1, 0..height, 0..width)?;
         normalise(&mut mask, scale);
-        if let Some(bad) = bad {
-            let mut mask = mask.index_axis_mut(Axis(0), 0);
-            mask.zip_mut_with(bad, |mask, bad| {
-                if *bad {
-                    *mask = f32::NAN
-                }
-            });
-        }
         to.write_frame(mask.index_axis(Axis(0), 0))?;
         report_progress(progress, AVERAGING_SHARE + 0.1 * (frame + 1) as f64 / frames as f64)?;
     }
@@ -312,8 +316,6 @@ fn study(masks: &Reader, scale: f32, progress: &mut Progress<'_>) -> Result<Mask
         let end = rows.end;
         let mut band = masks.read_window(0..frames, rows, 0..width)?;
         normalise(&mut band, scale);
-        // Pixels that were not measured count as dark.
-        band.mapv_inplace(|mask| if mask.is_nan() { 0.0 } else { mask });
         study.add(band.view()).map_err(refused)?;
         report_progress(progress, 0.9 + 0.1 * end as f64 / height as f64)?;
     }

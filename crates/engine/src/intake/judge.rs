@@ -10,9 +10,8 @@ use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use optics::{
     Displacement, Magnified, MeasurementFigures, MeasurementStudy, REACH, central, displacement,
-    judge_measurement, magnification, magnified,
+    judge_measurement, magnification, magnified, with_means,
 };
-use reconstruction::unmeasured::filled;
 
 /// Side of a checked window without its margin, in pixels.
 const WINDOW: usize = 64;
@@ -191,6 +190,8 @@ impl Turn {
 const MISPLACED_GAIN: f64 = 4.0;
 /// Smallest share of the fine structure that masks explain at the right place.
 const MIN_EXPLAINED: f64 = 0.08;
+/// Smallest number of measured pixels per frame. With fewer, a search finds masks that explain [`MIN_EXPLAINED`] by chance.
+const PIXELS_PER_FRAME: f64 = 50.0;
 /// Largest displacement that is searched, in pixels along each axis.
 const LARGEST_DISPLACEMENT: usize = 32;
 
@@ -243,7 +244,9 @@ fn explained_after(
     let (mask_columns, y_columns) = cut(width, displacement.columns);
     let mut study = MeasurementStudy::new(frames);
     study.add(masks.slice(s![.., mask_rows, mask_columns]), y.slice(s![y_rows, y_columns]), (0, 0));
-    study.finish().map_or(0.0, |figures| figures.explained)
+    let figures =
+        study.finish().filter(|figures| figures.pixels > PIXELS_PER_FRAME * frames as f64);
+    figures.map_or(0.0, |figures| figures.explained)
 }
 
 /// Looks for a displacement by more pixels than a fit of the frames covers, as after a wrong crop.
@@ -259,12 +262,11 @@ fn displaced_masks(
     let (rows, columns) = (window(height), window(width));
     let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
     let band = masks.read_window(0..frames, rows, columns)?;
-    let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
-    let y = filled(y.index_axis(Axis(0), 0));
-    let found = displacement(band.sum_axis(Axis(0)).view(), y.view(), reach);
-    let found = found.filter(|found| found.explained > MIN_EXPLAINED);
+    let y = y.index_axis(Axis(0), 0);
+    let found = displacement(band.sum_axis(Axis(0)).view(), y, reach);
+    let found = found.filter(|found| found.explained > MIN_EXPLAINED && !found.is_none());
     Ok(found.map(|found| {
-        let explained = explained_after(band.view(), y.view(), &found);
+        let explained = explained_after(band.view(), y, &found);
         let detail = format!(
             "the masks explain {:.0} % of the fine structure of the measurement when shifted by {} rows and {} columns, \
              but only {:.1} % without a shift. The measurement is probably a crop that begins at another place than the \
@@ -297,10 +299,9 @@ fn magnified_masks(
     };
     let (rows, columns) = (window(height), window(width));
     let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns.clone())?;
-    let y = filled(y.index_axis(Axis(0), 0));
-    let band = masks.read_window(0..frames, rows, columns)?;
-    let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
-    let found = magnification(band.sum_axis(Axis(0)).view(), y.view());
+    let y = y.index_axis(Axis(0), 0);
+    let band = with_means(masks.read_window(0..frames, rows, columns)?.view());
+    let found = magnification(band.sum_axis(Axis(0)).view(), y);
     let found = found.filter(|found| (found.factor - 1.0).abs() > SMALLEST_GROWTH);
     let Some(Magnified { factor, displacement }) = found else { return Ok(None) };
     // The search compares the sum of the masks; the fit of all frames decides.
@@ -311,7 +312,7 @@ fn magnified_masks(
     let Some(size) = enlarged.first().map(Array2::dim) else { return Ok(None) };
     let views: Vec<_> = enlarged.iter().map(|mask| mask.view()).collect();
     let Ok(enlarged) = ndarray::stack(Axis(0), &views) else { return Ok(None) };
-    let y = central(y.view(), size);
+    let y = central(y, size);
     let explained = explained_after(enlarged.view(), y, &displacement);
     let change = match factor > 1.0 {
         true => format!("enlarged by a factor of about {factor:.2}"),
@@ -383,9 +384,8 @@ fn study(
                 false => turn.read(masks, (&place.0, &place.1))?,
             };
             let y = snapshots.read_lattice(snapshot..snapshot + 1, place, step)?;
-            let band = band.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
             let first = (rows.start, columns.start);
-            study.add(band.view(), filled(y.index_axis(Axis(0), 0)).view(), first);
+            study.add(band.view(), y.index_axis(Axis(0), 0), first);
         }
     }
     Ok(study)

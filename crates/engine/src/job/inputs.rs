@@ -1,35 +1,21 @@
-//! The files and the settings of their reading that determine a result, as manifests record them.
+//! The requests and the files that determine a result, as manifests record them and as jobs are repeated from them.
 
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
-use super::{CalibrationRequest, Captures, JobId, MeasurementRequest, Sha256};
-use formats::{Crop, Packing};
+use super::{CalibrationRequest, JobId, MeasurementRequest, Sha256};
 use reconstruction::registration::Correction;
 
-/// The origin of masks. Settings that are not used are left out.
+/// The origin of masks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MaskInputs {
     /// The file of the masks: the upload, or the npy file of masks that the service has made.
     pub masks_sha256: Sha256,
     /// Order of the axes in which the masks were read; null for pictures.
     pub masks_axes: Option<String>,
-    /// Name of the array in a file of several.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub masks_array: Option<String>,
-    /// Window of each mask.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub masks_crop: Option<Crop>,
-    /// First and last mask in the file, both included.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub masks_frames: Option<[usize; 2]>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub masks_packing: Option<Packing>,
-    /// The map of bad pixels.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub bad_pixels_sha256: Option<Sha256>,
-    /// The captures from which the masks were made.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub captures: Option<Captures>,
+    /// The request that repeats the masks. It has neither `masks` nor `captures` if a job has corrected them.
+    #[serde(default)]
+    pub calibration: Map<String, Value>,
     /// The registration that has corrected the masks.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub registration_of: Option<Box<CorrectedMasks>>,
@@ -48,26 +34,13 @@ pub struct CorrectedMasks {
     pub masks: MaskInputs,
 }
 
-/// The origin of snapshots. Settings that are not used are left out.
+/// The origin of snapshots.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MeasurementInputs {
-    pub measurement_sha256: Sha256,
     /// Order of the axes in which the measurement was read; null for pictures.
     pub measurement_axes: Option<String>,
-    /// Name of the array in a file of several.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub measurement_array: Option<String>,
-    /// Window of each snapshot and dark frame.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub measurement_crop: Option<Crop>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub measurement_packing: Option<Packing>,
-    /// The dark frames; the average of all was subtracted.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub dark_sha256: Vec<Sha256>,
-    /// Smallest stored number of a saturated pixel.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub saturation: Option<u32>,
+    /// The request that repeats the measurement, without its calibration.
+    pub measurement: Map<String, Value>,
 }
 
 /// The inputs of a job.
@@ -90,12 +63,7 @@ impl CalibrationRequest {
         MaskInputs {
             masks_sha256: masks,
             masks_axes: axes,
-            masks_array: self.array.as_ref().map(ToString::to_string),
-            masks_crop: self.crop,
-            masks_frames: self.frames,
-            masks_packing: self.packing,
-            bad_pixels_sha256: self.bad_pixels,
-            captures: self.captures.clone(),
+            calibration: fields(self, &["name", "registration_of"]),
             registration_of: corrected.map(Box::new),
         }
     }
@@ -104,14 +72,17 @@ impl CalibrationRequest {
 impl MeasurementRequest {
     /// The origin of the snapshots that this request has made.
     pub fn inputs(&self, axes: Option<String>) -> MeasurementInputs {
-        MeasurementInputs {
-            measurement_sha256: self.data,
-            measurement_axes: axes,
-            measurement_array: self.array.as_ref().map(ToString::to_string),
-            measurement_crop: self.crop,
-            measurement_packing: self.packing,
-            dark_sha256: self.dark.clone(),
-            saturation: self.saturation,
-        }
+        let measurement = fields(self, &["name", "calibration"]);
+        MeasurementInputs { measurement_axes: axes, measurement }
     }
+}
+
+/// The fields of a request, without those in `names` and without empty ones.
+pub fn fields(request: &impl Serialize, names: &[&str]) -> Map<String, Value> {
+    // Requests are objects, which serialize without an error.
+    let Ok(Value::Object(fields)) = serde_json::to_value(request) else { return Map::new() };
+    let is_empty = |value: &Value| value.is_null() || value.as_array().is_some_and(Vec::is_empty);
+    let kept =
+        |(name, value): &(String, Value)| !names.contains(&name.as_str()) && !is_empty(value);
+    fields.into_iter().filter(kept).collect()
 }

@@ -29,14 +29,14 @@ pub use ids::{
     CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,
     WorkerId,
 };
-pub use inputs::{CorrectedMasks, Inputs, MaskInputs, MeasurementInputs};
+pub use inputs::{CorrectedMasks, Inputs, MaskInputs, MeasurementInputs, fields};
 pub use model::{JobModel, ModelFacts, ModelRecord, ModelTensor, ModelTrial, ModelVerdict};
 pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::Pool;
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};
 pub use reconstruction::schedule::Schedule;
 pub use registration::{Registered, RegistrationRequest};
-pub use repetition::Repetition;
+pub use repetition::repetition;
 pub use report::{
     CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, Severity,
 };

@@ -180,8 +180,9 @@ impl CalibrationReport {
 impl MaskReport {
     fn new(figures: &MaskFigures) -> Self {
         let correlations = figures.correlations();
-        let gram = || figures.gram.iter().map(|&value| f64::from(value));
-        let pixels = figures.gram.len().max(1) as f64;
+        let measured = || figures.gram.iter().filter(|value| !value.is_nan());
+        let gram = || measured().map(|&value| f64::from(value));
+        let pixels = figures.measured_pixels.max(1) as f64;
         Self {
             mean: figures.overall_mean(),
             deviation: figures.mean_deviation(),

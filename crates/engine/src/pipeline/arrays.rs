@@ -43,26 +43,15 @@ impl Arrays {
         Reader::open(&self.masks.0, &Limits::default())
     }
 
-    /// The sum of all masks \[H,W\] after their correction, in which pixels that were not measured count as 0. It reads one
-    /// mask at a time, and moves their sum.
+    /// The [light] of the masks after their correction. It reads one mask at a time.
     pub fn light(&self, monitor: &Monitor) -> Result<Array2<f32>> {
-        let known = |mask: f32| if mask.is_nan() { 0.0 } else { mask };
         let masks = self.masks()?;
-        let mut light = Array2::zeros((masks.info().height, masks.info().width));
-        for frame in 0..masks.info().frames {
+        let size = (masks.info().height, masks.info().width);
+        let read = |frame| {
             monitor.check()?;
-            let mask = plane(&masks, frame)?;
-            light += &(if self.correction.is_some() { mask } else { mask.mapv_into(known) });
-        }
-        let Some(correction) = self.correction else { return Ok(light) };
-        // Moved masks are clipped to [0,1], so the sum is moved as a mean.
-        let frames = masks.info().frames as f32;
-        let mean = (light / frames).insert_axis(Axis(0));
-        let (_, height, width) = mean.dim();
-        let moved = Interpolated::new(mean.view(), correction.interpolation);
-        let source = correction.motion.source([height, width], [0; 2]);
-        let moved = moved.window(&source, 0..height, 0..width).remove_axis(Axis(0));
-        Ok(moved.mapv_into(|mean| frames * known(mean)))
+            Ok(plane(&masks, frame)?)
+        };
+        light((0..masks.info().frames).map(read), size, self.correction)
     }
 
     /// One snapshot \[H,W\].
@@ -83,10 +72,38 @@ impl Arrays {
         let snapshots = Reader::open(&self.snapshots.0, &Limits::default())?;
         let y = snapshot_window(&snapshots, frames, place, self.correction)?;
         let masks = mask_window(&masks, place, self.correction)?;
-        let masks = masks.mapv_into(|mask| if mask.is_nan() { 0.0 } else { mask });
+        let masks = masks.mapv_into(known);
         let all_snapshots = 0..y.dim().0;
         Ok(TileInput { masks, y, white, pieces: vec![all_snapshots] })
     }
+}
+
+/// The sum of masks \[H,W\] after a correction, in which pixels that were not measured count as 0. It moves their sum.
+///
+/// Errors: the first one of `masks`.
+pub fn light<E>(
+    masks: impl ExactSizeIterator<Item = Result<Array2<f32>, E>>,
+    (height, width): (usize, usize),
+    correction: Option<Correction>,
+) -> Result<Array2<f32>, E> {
+    let frames = masks.len() as f32;
+    let mut light = Array2::zeros((height, width));
+    for mask in masks {
+        let mask = mask?;
+        light += &(if correction.is_some() { mask } else { mask.mapv_into(known) });
+    }
+    let Some(correction) = correction else { return Ok(light) };
+    // Moved masks are clipped to [0,1], so the sum is moved as a mean.
+    let mean = (light / frames).insert_axis(Axis(0));
+    let moved = Interpolated::new(mean.view(), correction.interpolation);
+    let source = correction.motion.source([height, width], [0; 2]);
+    let moved = moved.window(&source, 0..height, 0..width).remove_axis(Axis(0));
+    Ok(moved.mapv_into(|mean| frames * known(mean)))
+}
+
+/// The value of a mask that the solver uses: 0 where it is not known.
+pub fn known(mask: f32) -> f32 {
+    if mask.is_nan() { 0.0 } else { mask }
 }
 
 /// Reads a window of some frames of a prepared array.
@@ -141,15 +158,30 @@ pub fn snapshot_window(
     correction: Option<Correction>,
 ) -> Result<Array3<f32>, FormatError> {
     let mut y = window(snapshots, range, place)?;
-    let Some(Correction { motion, .. }) = correction else { return Ok(y) };
-    let sensor = [snapshots.info().height, snapshots.info().width];
+    if let Some(correction) = correction {
+        hide_uncovered(
+            &mut y,
+            (snapshots.info().height, snapshots.info().width),
+            place,
+            correction,
+        );
+    }
+    Ok(y)
+}
+
+/// Marks pixels of a window of snapshots \[S,h,w\] with NaN where no mask is known after a correction.
+pub fn hide_uncovered(
+    y: &mut Array3<f32>,
+    (height, width): (usize, usize),
+    place: &Window,
+    correction: Correction,
+) {
     for ((_, row, column), value) in y.indexed_iter_mut() {
         let at = [place.rows.start + row * place.step, place.columns.start + column * place.step];
-        if !motion.covers(sensor, at) {
+        if !correction.motion.covers([height, width], at) {
             *value = f32::NAN;
         }
     }
-    Ok(y)
 }
 
 /// Reads one frame \[H,W\] of a prepared array.

@@ -7,13 +7,14 @@ use std::collections::BTreeMap;
 
 use ndarray::{Array2, Axis};
 use serde::{Serialize, Serializer};
+use serde_json::{Map, Value};
 
 use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, TileRecord};
 use crate::job::{
     Algorithm, Assessment, CalibrationId, Dispersion, Finding, Inputs, JobId, JobSpec, Label,
-    MeasurementId, ModelId, ModelRecord, Mosaic, Registered, Repetition, ResultFile, SceneShape,
-    Schedule, Sha256, TaskKind,
+    MeasurementId, ModelId, ModelRecord, Mosaic, Registered, ResultFile, SceneShape, Schedule,
+    Sha256, TaskKind, repetition,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -172,7 +173,7 @@ impl Recipe {
 
     /// The manifest of a job, from the records of its tasks.
     pub fn job(self, job: JobId, spec: &JobSpec, tasks: JobTasks) -> JobManifest {
-        let JobTasks { requests, snapshots, seconds, attempts } = tasks;
+        let JobTasks { snapshots, seconds, attempts } = tasks;
         let cost = CostRecord::sum(snapshots.iter().map(|(_, record)| &record.run.cost));
         let mut seconds_by_task = BTreeMap::new();
         for (kind, seconds) in &seconds {
@@ -187,7 +188,12 @@ impl Recipe {
         let snapshots = snapshots.into_iter().map(entry).collect();
         JobManifest {
             schema: JOB_SCHEMA,
-            content: JobContent { requests, shape: self.shape, recipe: self, snapshots },
+            content: JobContent {
+                request: repetition(spec),
+                shape: self.shape,
+                recipe: self,
+                snapshots,
+            },
             run: JobRun {
                 run: RunRecord::ended(Some(job.to_string()), cost, None),
                 label: spec.label.clone(),
@@ -206,8 +212,6 @@ impl Recipe {
 /// The records of all tasks of a job except that of the manifest.
 #[derive(Debug, Clone)]
 pub struct JobTasks {
-    /// The requests that repeat the job.
-    pub requests: Repetition,
     /// The assembled snapshots, each with its index in the measurement.
     pub snapshots: Vec<(u32, SnapshotRecord)>,
     /// Seconds that each task took.
@@ -313,8 +317,8 @@ pub struct JobManifest {
 struct JobContent {
     #[serde(flatten)]
     recipe: Recipe,
-    /// The requests that repeat the job.
-    requests: Repetition,
+    /// The request that repeats the job. The recipe has the requests for its inputs.
+    request: Map<String, Value>,
     shape: SceneShape,
     snapshots: Vec<SnapshotEntry>,
 }
@@ -355,7 +359,10 @@ pub fn frame_attributes(content: &Content) -> Vec<Attributes> {
         ("algorithm".to_owned(), recipe.algorithm.into_str().to_owned()),
         ("snapshot".to_owned(), content.snapshot.to_string()),
         ("masksSha256".to_owned(), recipe.inputs.masks.masks_sha256.to_string()),
-        ("measurementSha256".to_owned(), recipe.inputs.measurement.measurement_sha256.to_string()),
+        (
+            "measurementSha256".to_owned(),
+            recipe.inputs.measurement.measurement["data"].as_str().unwrap_or_default().to_owned(),
+        ),
         ("whiteLevel".to_owned(), recipe.scale.white_level.to_string()),
     ];
     if let Some(mosaic) = recipe.shape.mosaic {

@@ -185,13 +185,14 @@ pub fn correct(
             let part = moved.read_window(index..index + 1, part, 0..width)?;
             mask.slice_mut(s![rows.clone(), ..]).assign(&part.index_axis(Axis(0), 0));
         }
-        light.zip_mut_with(&mask, |light, mask| *light += f64::from(mask.max(0.0)));
+        light.zip_mut_with(&mask, |light, mask| *light += f64::from(*mask));
         step(0.9 + 0.1 * frame as f64 / frames as f64, Some(mask.view()))?;
     }
+    let known = || light.iter().filter(|light| !light.is_nan());
     Ok(MaskStatistics {
         dead_pixels: light.iter().filter(|light| **light == 0.0).count() as u64,
         clipped_negative: 0,
-        mean: light.sum() / (frames * height * width) as f64,
+        mean: known().sum::<f64>() / (frames * known().count()).max(1) as f64,
     })
 }
 

@@ -1,6 +1,6 @@
 //! The two scales of a job: that of the solver, which all tiles share, and the white level of the frames, for people.
 
-use ndarray::{ArrayView3, Axis};
+use ndarray::{Array2, ArrayView3};
 
 use super::arrays::Arrays;
 use super::error::{PipelineError, Result};
@@ -10,11 +10,11 @@ use reconstruction::ReconError;
 use reconstruction::error::check_shape;
 use reconstruction::scale::ScaleEstimator;
 
-/// The solver's scale for snapshots \[S,H,W\] behind masks \[B,H,W\], both in memory.
+/// The solver's scale for snapshots \[S,H,W\] in memory. `light` \[H,W\] is that of their masks.
 ///
 /// Errors: those of [`ScaleEstimator::white`]; [`ReconError::Shape`] without snapshots.
-pub fn white(masks: ArrayView3<'_, f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
-    let estimator = ScaleEstimator::new(masks.sum_axis(Axis(0)));
+pub fn white(light: Array2<f32>, y: ArrayView3<'_, f32>) -> Result<f32, ReconError> {
+    let estimator = ScaleEstimator::new(light);
     let whites = y.outer_iter().map(|snapshot| estimator.white(snapshot));
     let white = median_white(lit_snapshots(whites)?);
     check_shape(white.is_some(), "the measurement", "no snapshots", "at least one")?;

@@ -18,7 +18,7 @@ use crate::tables::things::{Calibration, Measurement, Thing};
 use crate::tables::workers::{self, Claimant};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Lab, MovieFormat, Registered,
-    Repetition, Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
+    Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
 };
 use engine::pipeline::derived::STACK;
 
@@ -63,8 +63,6 @@ pub struct JobTask {
     pub tiles: Vec<TileResult>,
     /// For the manifest: all other tasks of the job, in order.
     pub records: Vec<TaskRecord>,
-    /// For the manifest: the requests that repeat the job.
-    pub repetition: Option<Repetition>,
 }
 
 /// The check of a request's uploads.
@@ -183,27 +181,61 @@ macro_rules! take_text {
     };
 }
 
+/// Condition for the check of a user's network.
+macro_rules! network_check {
+    () => {
+        "(kind = 'check' AND EXISTS (SELECT 1 FROM requests WHERE requests.id = tasks.thing AND what = 'model'))"
+    };
+}
+
 /// The indexes lead past the tasks that a claimant may not have.
 impl Claimant<'_> {
     fn look(self) -> &'static str {
         match self {
-            Self::Local => look_text!("", "tasks_ready"),
-            Self::WithoutTiles => look_text!("AND kind <> 'tile'", "tasks_others"),
-            Self::Light => look_text!("AND light = 1", "tasks_light", "tasks_light_of_job"),
+            Self::Local => look_text!(concat!("AND NOT ", network_check!()), "tasks_ready"),
+            Self::WithoutTiles => {
+                look_text!(concat!("AND kind <> 'tile' AND NOT ", network_check!()), "tasks_others")
+            }
+            Self::Light => look_text!(
+                concat!("AND light = 1 AND NOT ", network_check!()),
+                "tasks_light",
+                "tasks_light_of_job"
+            ),
+            Self::Networks => look_text!(
+                concat!("AND light = 1 AND job IS NULL AND ", network_check!()),
+                "tasks_light"
+            ),
             Self::Pool(_) => look_text!("AND kind = 'tile'", "tasks_tiles"),
         }
     }
 
     fn take(self) -> &'static str {
         match self {
-            Self::Local => take_text!("", "", "tasks_ready", "tasks_ready_of_job"),
-            Self::WithoutTiles => {
-                take_text!("AND kind <> 'tile'", "", "tasks_others", "tasks_others_of_job")
-            }
+            Self::Local => take_text!(
+                concat!("AND NOT ", network_check!()),
+                "",
+                "tasks_ready",
+                "tasks_ready_of_job"
+            ),
+            Self::WithoutTiles => take_text!(
+                concat!("AND kind <> 'tile' AND NOT ", network_check!()),
+                "",
+                "tasks_others",
+                "tasks_others_of_job"
+            ),
             // It begins no job.
-            Self::Light => {
-                take_text!("AND light = 1", " AND job IS NULL", "tasks_light", "tasks_light_of_job")
-            }
+            Self::Light => take_text!(
+                concat!("AND light = 1 AND NOT ", network_check!()),
+                " AND job IS NULL",
+                "tasks_light",
+                "tasks_light_of_job"
+            ),
+            Self::Networks => take_text!(
+                concat!("AND light = 1 AND ", network_check!()),
+                " AND job IS NULL",
+                "tasks_light",
+                "tasks_light_of_job"
+            ),
             Self::Pool(_) => {
                 take_text!("AND kind = 'tile'", "", "tasks_tiles", "tasks_tiles_of_job")
             }
@@ -301,14 +333,11 @@ impl Store {
             facts.fetch_one(&self.readers).await?;
         let calibration = self.thing_of_any_lab(spec.calibration).await?;
         let measurement = self.thing_of_any_lab(spec.measurement).await?;
-        let (mut tiles, mut records, mut repetition) = (Vec::new(), Vec::new(), None);
+        let (mut tiles, mut records) = (Vec::new(), Vec::new());
         match kind {
             TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
             TaskKind::White => tiles = self.all_tile_results(job).await?,
-            TaskKind::Manifest => {
-                records = self.task_records(job).await?;
-                repetition = self.repetition(&spec).await?;
-            }
+            TaskKind::Manifest => records = self.task_records(job).await?,
             _ => {}
         }
         let [prepared, pilot, white] =
@@ -323,23 +352,7 @@ impl Store {
             white,
             tiles,
             records,
-            repetition,
         })))
-    }
-
-    /// The requests that repeat a job.
-    async fn repetition(&self, spec: &JobSpec) -> Result<Option<Repetition>> {
-        let mut connection = self.readers.acquire().await?;
-        let masks = requests::find(&mut connection, spec.calibration.into()).await?.submission;
-        let data = requests::find(&mut connection, spec.measurement.into()).await?.submission;
-        let (Submission::Calibration(masks), Submission::Measurement(data)) = (masks, data) else {
-            return Ok(None);
-        };
-        let decode = |error: serde_json::Error| StoreError::Corrupt {
-            column: "request",
-            value: error.to_string(),
-        };
-        Repetition::new(&masks, &data, spec).map(Some).map_err(decode)
     }
 
     async fn movie_work(
@@ -490,6 +503,7 @@ mod tests {
         let store = Store::open(folder.path(), purpose).await.unwrap();
         // The look for leases that have run out reads what runs.
         let (no_tiles, light) = (Claimant::WithoutTiles, Claimant::Light);
+        let networks = Claimant::Networks;
         let pool = Claimant::Pool("gpu");
         for (text, index, others) in [
             (pool.look(), "INDEX tasks_tiles", 1),
@@ -498,6 +512,8 @@ mod tests {
             (no_tiles.take(), "INDEX tasks_others", 0),
             (light.look(), "INDEX tasks_light", 1),
             (light.take(), "INDEX tasks_light", 0),
+            (networks.look(), "INDEX tasks_light", 1),
+            (networks.take(), "INDEX tasks_light", 0),
         ] {
             let plan = plan(&store, text).await;
             let good = [index, "PRIMARY KEY (id=?)"];

@@ -89,7 +89,8 @@ impl Store {
     }
 
     /// Deletes a job that has ended, with its results.
-    /// Errors: [`StoreError::NotFinal`] if it still runs or waits.
+    /// Errors: [`StoreError::NotFinal`] if it still runs or waits; [`StoreError::JobInUse`] while its masks become a
+    /// calibration.
     pub async fn delete_job(&self, lab: &Lab, id: JobId) -> Result<()> {
         self.job(lab, id).await?;
         self.remove_job(id).await
@@ -101,6 +102,13 @@ impl Store {
         let state = jobs::state(&mut transaction, id).await?;
         if !state.is_final() || running_tasks(&mut transaction, id).await? > 0 {
             return Err(StoreError::NotFinal(state));
+        }
+        let calibration = "SELECT requests.id FROM requests JOIN jobs USING (lab)
+                           WHERE jobs.id = ?1 AND what = 'calibration' AND facts IS NULL AND refusal IS NULL
+                           AND request ->> 'registration_of' = ?1 LIMIT 1";
+        let calibration = sql_as!(calibration, [id]).fetch_optional(&mut *transaction).await?;
+        if let Some(calibration) = calibration {
+            return Err(StoreError::JobInUse(calibration));
         }
         self.drop_tiles(&mut transaction, id).await?;
         self.drop_movies(&mut transaction, id, None).await?;

@@ -117,7 +117,7 @@ impl Store {
 }
 
 /// Records a request, with the uploads that it needs. Returns their size in bytes.
-/// Errors: [`StoreError::NotFound`] if an upload or the calibration was deleted.
+/// Errors: [`StoreError::NotFound`] if an upload, the calibration or the job was deleted.
 pub async fn insert(
     connection: &mut SqliteConnection,
     (lab, token): (&Lab, Option<TokenId>),
@@ -125,7 +125,10 @@ pub async fn insert(
     (submission, limits, origin): (&Submission, &CheckLimits, Option<&str>),
 ) -> Result<u64> {
     let calibration = submission.calibration();
-    require(connection, calibration.map(Reference::Calibration).as_slice()).await?;
+    let job = submission.registration_of().map(Reference::Job);
+    let references: Vec<_> =
+        calibration.map(Reference::Calibration).into_iter().chain(job).collect();
+    require(connection, &references).await?;
     let text = match submission {
         Submission::Calibration(request) => serde_json::to_string(request),
         Submission::Measurement(request) => serde_json::to_string(request),

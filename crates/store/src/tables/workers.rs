@@ -35,6 +35,9 @@ pub enum Claimant<'a> {
     /// One that takes short tasks alone, so that they wait for no tile. It begins no job: a job would be shown as
     /// running though nobody computes it.
     Light,
+    /// The only one that checks networks of users, one after the other. Such a check may hang until its time is over, and
+    /// must delay nothing else.
+    Networks,
     /// The hub, for this pool of workers on other machines: tiles alone, under a lease that does not
     /// run out.
     Pool(&'a str),
@@ -88,7 +91,7 @@ impl Store {
                 device,
                 now,
                 now,
-                claimant == Claimant::Light,
+                matches!(claimant, Claimant::Light | Claimant::Networks),
                 matches!(claimant, Claimant::Local | Claimant::Pool(_))
             ]
         )

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use futures_util::FutureExt;
 
-use super::Lab;
+use super::{Lab, new_request};
 use crate::{
     Checked, Inserted, JobFilter, NewCalibration, NewMeasurement, NewModel, Product, StoreError,
 };
@@ -120,6 +120,24 @@ async fn dark_frames_and_maps_are_kept_while_something_was_made_with_them() {
     lab.store.delete(&local, measurement).await.unwrap();
     lab.store.delete(&local, calibration).await.unwrap();
     assert_eq!(lab.store.collect(soon).await.unwrap().len(), 4);
+}
+
+#[tokio::test]
+async fn a_job_is_kept_until_the_calibration_from_it_is_made() {
+    let lab = Lab::new().await;
+    let local = engine::job::Lab::local();
+    let job = lab.submit(0).await;
+    lab.store.cancel_job(&local, job).await.unwrap();
+    let asked = CalibrationRequest { registration_of: Some(job), ..CalibrationRequest::default() };
+    let new = new_request(Submission::Calibration(asked));
+    let made = lab.store.request::<CalibrationId>((&local, None), &new, None).await.unwrap();
+    let refused = lab.store.delete_job(&local, job).await.unwrap_err();
+    assert!(matches!(refused, StoreError::JobInUse(by) if by == made.id()), "{refused}");
+    assert!(refused.to_string().contains(&made.id().to_string()), "{refused}");
+    lab.store.delete(&local, made.id()).await.unwrap();
+    lab.store.delete_job(&local, job).await.unwrap();
+    let late = lab.store.request::<CalibrationId>((&local, None), &new, None).await;
+    assert!(matches!(late, Err(StoreError::NotFound { what: "job", .. })), "{late:?}");
 }
 
 #[tokio::test]
