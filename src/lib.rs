@@ -4,6 +4,8 @@ pub mod audit;
 pub mod cli;
 pub mod config;
 pub mod http;
+#[cfg(feature = "otel")]
+mod traces;
 mod webhooks;
 
 /// A builder of HTTP clients that trust the certificates of the system, or those of `SSL_CERT_FILE` and `SSL_CERT_DIR`.
