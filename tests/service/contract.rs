@@ -122,12 +122,9 @@ async fn the_reference_loads_its_files_from_the_service_alone() {
     let app = TestApp::start().await;
     let page = app.get("/docs").await.expect(200);
     let policy = page.header("content-security-policy").to_owned();
-    assert!(policy.contains("script-src 'self'; style-src 'nonce-"), "{policy}");
+    assert!(policy.contains("script-src 'self'; style-src 'sha256-"), "{policy}");
     assert!(!policy.contains("unsafe"), "{policy}");
     let text = String::from_utf8(page.bytes).unwrap();
-    let (_, nonce) = policy.split_once("'nonce-").unwrap();
-    let nonce = nonce.split('\'').next().unwrap();
-    assert!(nonce.len() >= 22 && text.contains(&format!("<style nonce=\"{nonce}\">")), "{nonce}");
     let addresses = text.split("=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
     let scripts: Vec<&str> = addresses.filter(|address| address.ends_with(".js")).collect();
     assert_eq!(
@@ -221,7 +218,7 @@ async fn every_route_refuses_unknown_query_parameters_and_knows_those_of_the_con
                 continue;
             }
             let parts = path.split('/').map(|part| match part {
-                "{sha256}" => "0".repeat(64),
+                "{sha256}" => "a".repeat(64),
                 "{lab}" => "local".into(),
                 "{format}" if path.ends_with("{path}") => "zarr".into(),
                 "{format}" => "exr".into(),

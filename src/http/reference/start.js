@@ -20,8 +20,6 @@ async function start(root) {
     downloadUrls: [{ title: "YAML", url: "openapi.yaml" }, { title: "JSON", url: "openapi.json" }],
     hideSchemaTitles: true,
     nativeScrollbars: true,
-    // The policy of the page refuses style elements without it.
-    nonce: document.querySelector("style").nonce,
     requiredPropsFirst: true,
     showExtensions: ["x-extensible-enum"],
   };
