@@ -23,7 +23,7 @@ spectral lint --fail-severity warn --ruleset "$here/spectral.yaml" "$contract"
 openapi-typescript --default-non-nullable false "$contract" --output "$out/api.d.ts" 2>&1 | tee "$out/typescript.log"
 if grep -qi warn "$out/typescript.log"; then exit 1; fi
 cp "$here"/round_trip.* "$out/"
-tsc --strict --module nodenext --target es2022 --types node "$out/round_trip.mts" "$out/api.d.ts"
+(cd "$out" && tsc --strict --module nodenext --target es2022 --types node round_trip.mts api.d.ts)
 openapi-python-client generate --path "$contract" --config "$here/openapi-python-client.yaml" \
   --output-path "$out/client" --fail-on-warning
 python -m compileall -q "$out/client"
