@@ -26,6 +26,8 @@ where
     if ENDPOINTS.iter().all(|variable| std::env::var_os(variable).is_none()) {
         return Ok(None);
     }
+    // The exporter's client takes the cryptography of the process. Fails only if it was set before.
+    let _ = rustls::crypto::ring::default_provider().install_default();
     let exporter = SpanExporter::builder().with_http().build();
     let exporter = exporter.map_err(|error| error.to_string())?;
     let provider = PROVIDER.get_or_init(|| {

@@ -386,7 +386,8 @@ async fn a_collector_gets_the_span_of_a_request() {
 
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let endpoint = format!("http://{}", listener.local_addr().unwrap());
-    let collector = std::thread::spawn(move || {
+    let (sender, collected) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
         let (mut socket, _) = listener.accept().unwrap();
         let (mut received, mut part) = (Vec::new(), [0; 4096]);
         // The spans follow the name of the service.
@@ -395,7 +396,7 @@ async fn a_collector_gets_the_span_of_a_request() {
             received.extend_from_slice(&part[..count]);
         }
         socket.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n").unwrap();
-        received
+        sender.send(received).unwrap();
     });
     let environment = [("OTEL_EXPORTER_OTLP_ENDPOINT", endpoint.as_str()), ("RUST_LOG", "info")];
     let mut app = TestApp::in_environment(&["--workers", "0"], &environment).await;
@@ -403,7 +404,7 @@ async fn a_collector_gets_the_span_of_a_request() {
     let request = app.request(Method::GET, "/v1/me");
     app.send(request.header("traceparent", format!("00-{trace}-00f067aa0ba902b7-01"))).await;
     assert!(app.stop().success());
-    let received = collector.join().unwrap();
+    let received = collected.recv_timeout(Duration::from_secs(60)).expect("the spans come");
     assert!(received.starts_with(b"POST /v1/traces "), "{:?}", String::from_utf8_lossy(&received));
     let trace = hex::decode(trace).unwrap();
     assert!(received.windows(16).any(|bytes| bytes == trace), "the span continues the trace");

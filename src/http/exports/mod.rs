@@ -36,7 +36,7 @@ enum Layer {
 }
 
 /// Sends an export of a snapshot that is a single file.
-pub(super) async fn of_snapshot(
+pub(super) async fn snapshot_file(
     QueryOf(query): QueryOf<ExportQuery>,
     clip: Clip,
     method: Method,
@@ -46,7 +46,7 @@ pub(super) async fn of_snapshot(
 }
 
 /// Sends an export of a whole job that is a single file.
-pub(super) async fn of_job(clip: Clip, method: Method, headers: HeaderMap) -> Result<Response> {
+pub(super) async fn job_file(clip: Clip, method: Method, headers: HeaderMap) -> Result<Response> {
     file(clip, ExportQuery::default(), (&method, &headers)).await
 }
 
