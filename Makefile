@@ -25,7 +25,7 @@ VULKAN_ICD ?= /usr/lib/chromium/vk_swiftshader_icd.json
 test-gpu: ## test the kernels of the feature gpu on software Vulkan
 	VK_ICD_FILENAMES=$(VULKAN_ICD) $(CARGO) test --package sci-recon-reconstruction --lib --features gpu gpu::
 
-deploy-check: judges runtime ## validate the samples under deploy/ and docker/ with the programs that read them, and use the service behind nginx and Caddy
+deploy-check: judges runtime clients ## validate the samples under deploy/ and docker/ with the programs that read them, and use the service behind nginx and Caddy, also with generated clients
 	$(CARGO) build --quiet
 	$(JUDGES)/bin/python tests/judges/deploy.py . $${CARGO_TARGET_DIR:-target}/debug/sci-recon $(VENV)/uploads
 
@@ -216,7 +216,7 @@ fmt:
 	$(CARGO) fmt --all --check
 
 lint:
-	$(CARGO) clippy --workspace --all-targets --features gpu -- -D warnings
+	$(CARGO) clippy --workspace --all-targets --features gpu,otel -- -D warnings
 
 # Findings per 1,000 words of the whole repository. Lower it when the rate falls; the aim is 1.0.
 PROSE_RATE ?= 1.0

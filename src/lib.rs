@@ -4,6 +4,8 @@ pub mod audit;
 pub mod cli;
 pub mod config;
 pub mod http;
+#[cfg(feature = "otel")]
+mod traces;
 mod webhooks;
 
 use std::path::{Path, PathBuf};

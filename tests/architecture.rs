@@ -376,3 +376,26 @@ fn the_check_detects_circles() {
     assert_eq!(circles(&between_siblings(&edges)), BTreeSet::from([folders]));
     assert!(files[&module("a::d")].foreign.contains("std::fs"));
 }
+
+#[test]
+fn the_version_and_its_date_are_the_same_everywhere() {
+    let text = |path: &str| fs::read_to_string(path).unwrap();
+    let between = |path: &str, before: &str, after: &str| {
+        let text = text(path);
+        let (_, rest) =
+            text.split_once(before).unwrap_or_else(|| panic!("{path} lacks {before:?}"));
+        rest.split(after).next().unwrap().to_owned()
+    };
+    let version = env!("CARGO_PKG_VERSION");
+    for (path, before, after) in [
+        ("CHANGELOG.md", "\n## ", " ("),
+        ("CITATION.cff", "\nversion: ", "\n"),
+        ("clients/python/pyproject.toml", "\nversion = \"", "\""),
+        ("openapi.yaml", "\n  version: ", "\n"),
+        ("deploy/conda/recipe.yaml", "\n  version: \"", "\""),
+    ] {
+        assert_eq!(between(path, before, after), version, "{path}");
+    }
+    let date = between("CITATION.cff", "\ndate-released: ", "\n");
+    assert_eq!(between("CHANGELOG.md", &format!("\n## {version} ("), ")"), date);
+}

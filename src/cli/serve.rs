@@ -64,7 +64,11 @@ fn io(action: &'static str) -> impl FnOnce(std::io::Error) -> ServeError {
 /// Serves until SIGTERM or Ctrl-C.
 pub fn run(settings: &ServeArguments) -> Result<(), ServeError> {
     logging::start(settings.log_format);
-    tokio::runtime::Runtime::new().map_err(io("start the runtime"))?.block_on(serve(settings))
+    let runtime = tokio::runtime::Runtime::new().map_err(io("start the runtime"))?;
+    let served = runtime.block_on(serve(settings));
+    #[cfg(feature = "otel")]
+    crate::traces::finish();
+    served
 }
 
 async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {

@@ -43,27 +43,6 @@ pub(super) async fn create(
     store(&app, &access, staged).await
 }
 
-/// `PUT /v1/blobs/{sha256}`: stores the raw body, which must have this hash.
-pub(super) async fn put(
-    Caller(app, access): Caller,
-    Params(sha256): Params<Sha256>,
-    headers: HeaderMap,
-    body: Body,
-) -> Result<Response> {
-    let (_slot, room) = match begin(&app, &access, &headers).await {
-        Ok(reserved) => reserved,
-        Err(error) => return Err(reject(error, &headers, body).await),
-    };
-    let staged = upload::receive(&app, room, body.into_data_stream()).await?;
-    check_digest(content_digest(&headers)?, || staged.sha256())?;
-    if staged.sha256() != sha256 {
-        let detail =
-            format!("the address has the SHA-256 {sha256}, but the bytes have {}", staged.sha256());
-        return Err(ApiError::new(Code::HashMismatch, detail));
-    }
-    store(&app, &access, staged).await
-}
-
 /// `GET /v1/blobs/{sha256}`: the size of the file, or 404 if the lab has not uploaded it.
 pub(super) async fn show(
     Caller(app, access): Caller,

@@ -148,6 +148,11 @@ pub type Result<T, E = ApiError> = std::result::Result<T, E>;
 /// Largest estimate in `Retry-After`, in seconds.
 pub(super) const MAX_RETRY_SECONDS: f64 = 600.0;
 
+/// An estimate in seconds, as `Retry-After` states it.
+pub(super) fn retry_seconds(estimate: f64) -> u64 {
+    estimate.clamp(1.0, MAX_RETRY_SECONDS).ceil() as u64
+}
+
 tokio::task_local! {
     /// The identifier of the request that is being answered.
     pub(super) static REQUEST_ID: String;
@@ -242,6 +247,14 @@ impl ApiError {
         self.with_header(header::RETRY_AFTER, seconds.into())
     }
 
+    /// As [`Self::retry_after`], if there is an estimate.
+    fn retry_soon(self, estimate: Option<f64>) -> Self {
+        match estimate {
+            Some(estimate) => self.retry_after(retry_seconds(estimate)),
+            None => self,
+        }
+    }
+
     /// The body of the answer.
     pub(super) fn problem(&self) -> Problem {
         let (status, title, retryable, _) = self.code.row();
@@ -281,14 +294,10 @@ impl ApiError {
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
-        let (status, _, retryable, _) = self.code.row();
-        let retryable = retryable && self.may_succeed_later;
+        let (status, ..) = self.code.row();
         let mut response = (status, Json(self.problem())).into_response();
         let headers = response.headers_mut();
         headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
-        if retryable && (status == StatusCode::TOO_MANY_REQUESTS || status.is_server_error()) {
-            headers.insert(header::RETRY_AFTER, HeaderValue::from_static("5"));
-        }
         let page = format!("</problems/{}>; rel=\"help\"", self.code.into_str());
         if let Ok(page) = HeaderValue::try_from(page) {
             headers.insert(header::LINK, page);
@@ -310,6 +319,7 @@ impl From<StoreError> for ApiError {
         if let Some(trouble) = error.disk_trouble() {
             return disk_error(trouble, &error);
         }
+        let retry_seconds = error.retry_seconds();
         let code = match &error {
             StoreError::NotFound { .. } => Code::NotFound,
             StoreError::NotReady { what: "calibration", .. } => Code::CalibrationNotReady,
@@ -324,7 +334,7 @@ impl From<StoreError> for ApiError {
             StoreError::HashMismatch { .. } => Code::HashMismatch,
             StoreError::QueueFull { .. } => Code::QueueFull,
             StoreError::Quota { .. } => Code::QuotaExceeded,
-            StoreError::ManyPartials(_) => Code::TooManyUploads,
+            StoreError::ManyPartials { .. } => Code::TooManyUploads,
             StoreError::ManyChecks { .. } => Code::TooManyChecks,
             StoreError::NoRoom { .. } | StoreError::NoShare { .. } => Code::InsufficientStorage,
             StoreError::Short { .. } => {
@@ -347,7 +357,7 @@ impl From<StoreError> for ApiError {
             busy if busy.is_busy() => {
                 tracing::warn!(%error, "the database is busy");
                 let detail = "the database is busy and nothing was changed; try again";
-                return Self::new(Code::Unavailable, detail);
+                return Self::new(Code::Unavailable, detail).retry_soon(retry_seconds);
             }
             StoreError::Database(_)
             | StoreError::Migrate(_)
@@ -359,13 +369,9 @@ impl From<StoreError> for ApiError {
             | StoreError::Refused { .. }
             | StoreError::Corrupt { .. } => return Self::internal(&error),
         };
-        if let StoreError::ManyChecks { mean_seconds: Some(seconds), .. } = error {
-            let seconds = seconds.clamp(1.0, MAX_RETRY_SECONDS).ceil() as u64;
-            return Self::new(code, error.to_string()).retry_after(seconds);
-        }
         // A failed calibration or measurement never becomes ready.
         let may_succeed_later = !matches!(error, StoreError::NotReady { error: Some(_), .. });
-        Self { may_succeed_later, ..Self::new(code, error.to_string()) }
+        Self { may_succeed_later, ..Self::new(code, error.to_string()) }.retry_soon(retry_seconds)
     }
 }
 

@@ -333,6 +333,7 @@ impl Listener {
             if changes.items.is_some() {
                 let last = changes.last;
                 let events = lab_events(store, changes).await?;
+                self.last_sent = last_received;
                 self.queue(last, &events);
                 return Ok(());
             }
@@ -364,25 +365,26 @@ impl Listener {
         }
     }
 
-    /// Queues the events of the lab. Only the last one has the number, so that a client that reconnects before it gets all
-    /// of them again.
+    /// Queues the events of the lab. Those before the last one have the number of the change before them, so that a client
+    /// that reconnects before the last one gets all of them again.
     fn queue(&mut self, number: i64, lab_events: &LabEvents) {
-        self.last_sent = number;
-        let mut events: Vec<Event> = NAMES
-            .into_iter()
-            .zip(lab_events)
+        let before = std::mem::replace(&mut self.last_sent, number);
+        let named = NAMES.into_iter().zip(lab_events);
+        let mut events = named
             .filter_map(|(name, labs)| {
                 Some(Event::default().event(name).data(labs.get(&self.lab)?))
             })
-            .collect();
-        if let Some(last) = events.pop() {
-            events.push(last.id(number.to_string()));
+            .peekable();
+        while let Some(event) = events.next() {
+            let id = if events.peek().is_some() { before } else { number };
+            self.waiting.push_back(event.id(id.to_string()));
         }
-        self.waiting.extend(events);
     }
 }
 
 /// The greeting, which makes a client read the lists. They include the changes up to this number.
 fn hello(number: i64) -> Event {
-    Event::default().event("hello").data("{}").id(number.to_string())
+    let change = Change { more: true, ..Change::default() };
+    let text = serde_json::to_string(&change).unwrap_or_default();
+    Event::default().event("hello").data(text).id(number.to_string())
 }

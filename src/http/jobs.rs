@@ -3,7 +3,7 @@
 use std::str::FromStr;
 
 use axum::Json;
-use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use serde_with::DeserializeFromStr;
@@ -12,9 +12,9 @@ use strum::VariantArray;
 use super::access::Access;
 use super::app::App;
 use super::context::{RequestContext, changed};
-use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result};
+use super::error::{ApiError, Code, MAX_RETRY_SECONDS, Problem, Result, retry_seconds};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{Cursor, Limit, NoQuery, PageBody};
+use super::page::{Cursor, Limit, PageBody};
 use super::truth;
 use engine::intake;
 use engine::job::{
@@ -321,11 +321,11 @@ async fn insert(
     }
 }
 
-/// Estimated seconds until a job ends: the time for all jobs, divided by their number.
+/// Estimated seconds until a job ends: the time for all jobs, divided by their number. Without a worker, none ends.
 async fn next_end(app: &App) -> Result<u64> {
     let Estimate { eta_seconds, queue_position } = app.store.estimate(&[]).await?;
-    let seconds = eta_seconds.unwrap_or(MAX_RETRY_SECONDS) / queue_position.max(1) as f64;
-    Ok(seconds.clamp(1.0, MAX_RETRY_SECONDS).ceil() as u64)
+    let mean = |all: f64| all / queue_position.max(1) as f64;
+    Ok(retry_seconds(eta_seconds.map_or(MAX_RETRY_SECONDS, mean)))
 }
 
 /// Resolves a request: checks it against its measurement, and fills in the defaults.
@@ -495,7 +495,6 @@ pub(super) async fn list(
 pub(super) async fn show(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    QueryOf(NoQuery {}): QueryOf<NoQuery>,
     request: RequestContext,
 ) -> Result<Response> {
     let wait = request.wait();
@@ -554,7 +553,11 @@ pub(super) async fn cancel(
     let _guard =
         request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.cancel_job(&access.lab, id).await?;
-    accepted(&app, &access.lab, id).await
+    let body = body(&app, &access.lab, id).await?;
+    // A running tile stops after the iteration that it is in.
+    let tiles = app.store.totals().await?.into_iter().find(|totals| totals.kind == "tile");
+    let iteration = tiles.map(|tiles| tiles.seconds / tiles.iterations.max(1) as f64);
+    accepted(&body, iteration.filter(|_| !body.state.is_final()))
 }
 
 pub(super) async fn retry(
@@ -565,13 +568,17 @@ pub(super) async fn retry(
     let _guard =
         request.precondition((&app.changes, &access.lab), body(&app, &access.lab, id)).await?;
     app.store.retry_job(&access.lab, id).await?;
-    accepted(&app, &access.lab, id).await
+    let body = body(&app, &access.lab, id).await?;
+    accepted(&body, body.progress.eta_seconds)
 }
 
-async fn accepted(app: &App, lab: &Lab, id: JobId) -> Result<Response> {
-    let retry_after: (HeaderName, &str) = (header::RETRY_AFTER, "1");
-    let answer = changed(StatusCode::ACCEPTED, &body(app, lab, id).await?)?;
-    Ok(([retry_after], answer).into_response())
+/// Answers 202 with a job, and with an estimate of the seconds until its end.
+fn accepted(body: &JobBody, estimate: Option<f64>) -> Result<Response> {
+    let mut answer = changed(StatusCode::ACCEPTED, body)?;
+    if let Some(estimate) = estimate {
+        answer.headers_mut().insert(header::RETRY_AFTER, retry_seconds(estimate).into());
+    }
+    Ok(answer)
 }
 
 pub(super) async fn delete(

@@ -1,96 +1,31 @@
 //! What happens to every request around its handler, apart from what layers of `tower-http` do.
 
 use std::any::Any;
-use std::convert::Infallible;
 use std::future::{Ready, ready};
-use std::time::Instant;
 
 use axum::BoxError;
 use axum::body::Body;
 use axum::error_handling::HandleErrorLayer;
-use axum::extract::{MatchedPath, OriginalUri, Request, State};
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, Version, header};
+use axum::extract::{OriginalUri, Request, State};
+use axum::http::{Extensions, HeaderMap, HeaderValue, Method, StatusCode, Version, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use tower::ServiceBuilder;
 use tower::layer::util::{Identity, Stack};
 use tower::limit::GlobalConcurrencyLimitLayer;
 use tower::load_shed::LoadShedLayer;
-use tower::{Layer, Service, ServiceBuilder, ServiceExt, service_fn};
-use tower_http::cors::CorsLayer;
-use tower_http::request_id::{MakeRequestId, RequestId};
+use tower_http::compression::CompressionLayer;
+use tower_http::compression::predicate::{And, Predicate, SizeAbove};
 use tower_http::set_header::SetResponseHeaderLayer;
-use tracing::Span;
-use tracing::field::Empty;
-use uuid::Uuid;
 
-use super::access::Admitted;
 use super::context::relative;
-use super::error::{ApiError, Code, REQUEST_ID};
-use super::metrics;
+use super::error::{ApiError, Code};
 use store::Store;
 
-const HEADER: HeaderName = HeaderName::from_static("x-request-id");
-const TRACE_PARENT: HeaderName = HeaderName::from_static("traceparent");
-
-/// Makes identifiers of requests.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct NewId;
-
-impl MakeRequestId for NewId {
-    fn make_request_id<B>(&mut self, _: &axum::http::Request<B>) -> Option<RequestId> {
-        HeaderValue::try_from(Uuid::now_v7().to_string()).ok().map(RequestId::new)
-    }
-}
-
-/// Removes an identifier with characters that a log can't show.
-pub(super) fn without_odd_id(mut request: Request) -> Request {
-    if request.headers().get(&HEADER).is_some_and(|id| !is_plain(id)) {
-        request.headers_mut().remove(&HEADER);
-    }
-    request
-}
-
-/// The span of a request, which its log lines show: its identifier, and the trace of a caller that sends `traceparent`.
-pub(super) fn span(request: &Request) -> Span {
-    let (method, path) = (request.method(), request.uri().path());
-    let id = identifier(request);
-    let span = tracing::info_span!(
-        "request", id, %method, path, lab = Empty, trace_id = Empty, parent_id = Empty
-    );
-    if let Some((trace, parent)) = trace_parent(request.headers()) {
-        span.record("trace_id", trace).record("parent_id", parent);
-    }
-    span
-}
-
-fn identifier(request: &Request) -> &str {
-    let id = request.headers().get(&HEADER).and_then(|id| id.to_str().ok());
-    id.unwrap_or("unknown")
-}
-
-/// The identifiers of the trace and of the caller's span, in hexadecimal digits (W3C Trace Context). A malformed or repeated
-/// header is ignored, as the standard requires.
-fn trace_parent(headers: &HeaderMap) -> Option<(&str, &str)> {
-    let mut values = headers.get_all(&TRACE_PARENT).iter();
-    let value = values.next().filter(|_| values.next().is_none())?.to_str().ok()?;
-    let is_hex = |text: &str, digits: usize| {
-        text.len() == digits && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'))
-    };
-    let is_identifier =
-        |text: &str, digits: usize| is_hex(text, digits) && text.bytes().any(|byte| byte != b'0');
-    let mut parts = value.split('-');
-    let (version, trace, parent, flags) =
-        (parts.next()?, parts.next()?, parts.next()?, parts.next()?);
-    // Later versions may have more parts.
-    let is_known = is_hex(version, 2) && version != "ff";
-    let is_complete = version != "00" || parts.next().is_none();
-    (is_known
-        && is_complete
-        && is_hex(flags, 2)
-        && is_identifier(trace, 32)
-        && is_identifier(parent, 16))
-    .then_some((trace, parent))
-}
+/// Bytes from which on compression saves more than its header costs.
+const COMPRESSED_FROM: u64 = 1024;
+/// Ending of the ETag of a compressed answer.
+const PACKED: &str = "-gzip\"";
 
 /// Refuses requests beyond a number in progress, so that a flood does not exhaust the memory.
 pub(super) type Shedding = ServiceBuilder<
@@ -107,6 +42,7 @@ pub(super) type Shedding = ServiceBuilder<
 pub(super) fn shedding(most: usize) -> Shedding {
     let overloaded: fn(BoxError) -> Ready<ApiError> = |_| {
         let detail = "too many requests are in progress; nothing was changed; try again";
+        // Of thousands one ends within a second, unless each takes an hour.
         ready(ApiError::new(Code::Unavailable, detail).retry_after(1))
     };
     ServiceBuilder::new()
@@ -127,50 +63,45 @@ pub(super) fn restrictions() -> [SetResponseHeaderLayer<HeaderValue>; 3] {
     })
 }
 
-/// Logs and counts the request when it is answered.
-pub(super) async fn observe(mut request: Request, next: Next) -> Response {
-    let id = identifier(&request).to_owned();
-    let (method, path) = (request.method().clone(), request.uri().path().to_owned());
-    let route = request.extensions().get::<MatchedPath>().map(|route| route.as_str().to_owned());
-    let admitted = Admitted::default();
-    request.extensions_mut().insert(admitted.clone());
-    let start = Instant::now();
-    let response = REQUEST_ID.scope(id, next.run(request)).await;
-    let (status, took) = (response.status().as_u16(), start.elapsed());
-    // A status that everyone polls for is not worth a line each. Strangers must not fill the log.
-    let is_stranger = admitted.get().is_none() && !response.status().is_server_error();
-    if is_stranger || is_quiet(&method, &path) {
-        tracing::debug!(status, ms = took.as_millis(), "answered");
-    } else {
-        tracing::info!(status, ms = took.as_millis(), "answered");
+type IsText = fn(StatusCode, Version, &HeaderMap, &Extensions) -> bool;
+
+/// Compresses texts, except files that accept ranges.
+pub(super) fn compression() -> CompressionLayer<And<SizeAbove, IsText>> {
+    let is_text: IsText = |_, _, fields, _| {
+        let kind = fields.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok());
+        let kind = kind.and_then(|kind| kind.split(';').next()).unwrap_or_default();
+        let is_text = match kind.split_once('/') {
+            Some(("text", form)) => form != "event-stream",
+            Some(("application", form)) => matches!(form, "json" | "problem+json" | "yaml"),
+            _ => kind == "image/svg+xml",
+        };
+        is_text && !fields.contains_key(header::ACCEPT_RANGES)
+    };
+    CompressionLayer::new().compress_when(SizeAbove::new(COMPRESSED_FROM).and(is_text))
+}
+
+/// Distinguishes the ETags of compressed answers, because strong ETags differ between encodings (RFC 9110, 8.8.3.3).
+/// Handlers know the ETags of the plain content alone.
+pub(super) async fn encoded_tags(mut request: Request, next: Next) -> Response {
+    let mut knows_packed = false;
+    for (name, value) in request.headers_mut() {
+        let is_condition = name == header::IF_MATCH || name == header::IF_NONE_MATCH;
+        let tags = value.to_str().ok().filter(|tags| is_condition && tags.contains(PACKED));
+        if let Some(Ok(plain)) = tags.map(|tags| tags.replace(PACKED, "\"").try_into()) {
+            *value = plain;
+            knows_packed = true;
+        }
     }
-    metrics::observe(known(&method), route.as_deref().unwrap_or("none"), status, took);
+    let mut response = next.run(request).await;
+    let is_known = response.status() == StatusCode::NOT_MODIFIED && knows_packed;
+    let fields = response.headers_mut();
+    if (is_known || fields.contains_key(header::CONTENT_ENCODING))
+        && let Some(tag) = fields.get(header::ETAG).and_then(|tag| tag.to_str().ok())
+        && let Ok(tag) = format!("{}{PACKED}", tag.trim_end_matches('"')).try_into()
+    {
+        fields.insert(header::ETAG, tag);
+    }
     response
-}
-
-fn is_quiet(method: &Method, path: &str) -> bool {
-    method == Method::GET && (!path.starts_with("/v1/") || path.starts_with("/v1/jobs"))
-}
-
-/// Methods are a label of the metrics, and clients can make up new ones without end.
-fn known(method: &Method) -> &'static str {
-    match *method {
-        Method::GET => "GET",
-        Method::HEAD => "HEAD",
-        Method::POST => "POST",
-        Method::PUT => "PUT",
-        Method::DELETE => "DELETE",
-        Method::PATCH => "PATCH",
-        Method::OPTIONS => "OPTIONS",
-        _ => "other",
-    }
-}
-
-/// True for an identifier that can stand in a log as it is.
-fn is_plain(id: &HeaderValue) -> bool {
-    let bytes = id.as_bytes();
-    (1..=100).contains(&bytes.len())
-        && bytes.iter().all(|byte| byte.is_ascii_alphanumeric() || b"-_.:/+=".contains(byte))
 }
 
 /// Makes references in headers relative to the address of the request, so that they hold below any prefix that a proxy
@@ -199,61 +130,6 @@ pub(super) async fn relative_references(mut request: Request, next: Next) -> Res
     response
 }
 
-/// Headers of answers that pages of other origins may read.
-pub(super) fn exposed() -> Vec<HeaderName> {
-    let tus = [
-        "tus-resumable",
-        "tus-version",
-        "tus-extension",
-        "tus-max-size",
-        "tus-checksum-algorithm",
-        "upload-offset",
-        "upload-length",
-        "upload-defer-length",
-        "upload-metadata",
-        "upload-expires",
-    ];
-    let others = ["preference-applied", "ratelimit", "ratelimit-policy"];
-    let own = tus.into_iter().chain(others).map(HeaderName::from_static);
-    let known = [
-        header::LOCATION,
-        header::CONTENT_LOCATION,
-        header::ETAG,
-        header::CONTENT_RANGE,
-        header::ACCEPT_RANGES,
-        header::CONTENT_DISPOSITION,
-        header::LINK,
-        header::RETRY_AFTER,
-        HEADER,
-    ];
-    own.chain(known).collect()
-}
-
-/// Adds the headers of CORS. An OPTIONS that is no preflight, as those of tus, goes to its handler.
-pub(super) fn cors<S>(
-    cors: CorsLayer,
-    service: S,
-) -> impl Service<Request, Response = Response, Error = Infallible, Future: Send>
-+ Clone
-+ Send
-+ Sync
-+ 'static
-where
-    S: Service<Request, Response = Response, Error = Infallible, Future: Send>
-        + Clone
-        + Send
-        + Sync
-        + 'static,
-{
-    let open = cors.layer(service.clone());
-    service_fn(move |request: Request| {
-        let is_plain = request.method() == Method::OPTIONS
-            && !request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
-        let (open, plain) = (open.clone(), service.clone());
-        async move { if is_plain { plain.oneshot(request).await } else { open.oneshot(request).await } }
-    })
-}
-
 /// Refuses a request that names two hosts, or none: a proxy before us and we may take it for different ones
 /// (RFC 9112, 3.2).
 pub(super) async fn one_host(request: Request, next: Next) -> Response {
@@ -265,10 +141,28 @@ pub(super) async fn one_host(request: Request, next: Next) -> Response {
     next.run(request).await
 }
 
+/// Refuses the query of a request whose handler reads none. `queries` has the methods of those that do.
+pub(super) async fn closed_query(
+    State(queries): State<Vec<&'static str>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let method = if request.method() == Method::HEAD { &Method::GET } else { request.method() };
+    let is_read = queries.iter().any(|known| method.as_str().eq_ignore_ascii_case(known));
+    let query = request.uri().query().filter(|query| !query.is_empty() && !is_read);
+    if let Some(name) = query.and_then(|query| query.split(['=', '&']).next()) {
+        let detail = format!("unknown parameter `{}`: this request takes none", shortened(name));
+        return ApiError::new(Code::InvalidQuery, detail).into_response();
+    }
+    next.run(request).await
+}
+
 /// The answer to a request that takes too long.
 pub(super) fn timed_out(seconds: u64) -> ApiError {
     tracing::warn!(seconds, "an answer took too long");
-    ApiError::new(Code::TimedOut, format!("there was no answer within {seconds} seconds"))
+    let detail = format!("there was no answer within {seconds} seconds");
+    // The cause has lasted for so long, and is expected to last as long again.
+    ApiError::new(Code::TimedOut, detail).retry_after(seconds)
 }
 
 /// After an upload that was refused on the way the connection still holds the rest of its body; a
@@ -338,44 +232,12 @@ mod tests {
     use axum::Router;
     use axum::body::Body;
     use axum::extract::Request;
-    use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+    use axum::http::{StatusCode, header};
     use axum::routing::get;
     use tokio::sync::Notify;
     use tower::ServiceExt;
 
-    use super::{TRACE_PARENT, shedding, trace_parent};
-
-    #[test]
-    fn a_trace_is_taken_from_a_valid_header_alone() {
-        let (trace, parent) = ("4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7");
-        let of = |values: &[&str]| {
-            let values = values.iter().map(|value| (TRACE_PARENT, value.parse().unwrap()));
-            let headers: HeaderMap<HeaderValue> =
-                values.fold(HeaderMap::new(), |mut all, (name, value)| {
-                    all.append(name, value);
-                    all
-                });
-            trace_parent(&headers).map(|(trace, parent)| (trace.to_owned(), parent.to_owned()))
-        };
-        let valid = format!("00-{trace}-{parent}-01");
-        for good in [valid.clone(), format!("cc-{trace}-{parent}-00-later")] {
-            assert_eq!(of(&[&good]), Some((trace.to_owned(), parent.to_owned())), "{good}");
-        }
-        assert_eq!(of(&[&valid, &valid]), None);
-        for bad in [
-            String::new(),
-            "00".to_owned(),
-            format!("00-{trace}-{parent}"),
-            format!("00-{trace}-{parent}-01-more"),
-            format!("ff-{trace}-{parent}-01"),
-            format!("00-{}-{parent}-01", trace.to_uppercase()),
-            format!("00-{}-{parent}-01", "0".repeat(32)),
-            format!("00-{trace}-{}-01", "0".repeat(16)),
-            format!("00-{trace}0-{parent}-01"),
-        ] {
-            assert_eq!(of(&[&bad]), None, "{bad}");
-        }
-    }
+    use super::shedding;
 
     #[tokio::test]
     async fn requests_beyond_the_limit_are_refused() {

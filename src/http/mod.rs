@@ -32,6 +32,8 @@ mod measurements;
 mod metrics;
 mod models;
 mod negotiation;
+mod observation;
+mod origins;
 mod page;
 mod pictures;
 mod problems;

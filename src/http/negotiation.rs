@@ -1,4 +1,4 @@
-//! Content negotiation (RFC 9110): the weights that a client gives to encodings and media types.
+//! Content negotiation (RFC 9110): the weights that a client gives to media types.
 
 use axum::http::{HeaderMap, HeaderName, header};
 
@@ -14,11 +14,6 @@ fn weighted(headers: &HeaderMap, name: HeaderName) -> impl Iterator<Item = (Stri
         let weight = parts.find_map(|part| part.strip_prefix("q=").map(str::to_owned));
         Some((item, weight.and_then(|weight| weight.trim().parse().ok()).unwrap_or(1.0)))
     })
-}
-
-/// True if the client lists gzip and does not rule it out.
-pub(super) fn takes_gzip(headers: &HeaderMap) -> bool {
-    weighted(headers, header::ACCEPT_ENCODING).any(|(item, weight)| item == "gzip" && weight > 0.0)
 }
 
 /// The encoding of a picture that the client prefers; of several, the one that it names, then the first of
@@ -60,24 +55,12 @@ pub(super) fn picture_encoding(headers: &HeaderMap) -> Result<Encoding> {
 
 #[cfg(test)]
 mod tests {
-    use super::{picture_encoding, takes_gzip};
+    use super::picture_encoding;
     use axum::http::HeaderMap;
     use formats::display::Encoding;
 
     fn headers(name: &str, value: &str) -> HeaderMap {
         HeaderMap::from_iter([(name.parse().unwrap(), value.parse().unwrap())])
-    }
-
-    #[test]
-    fn gzip_is_sent_only_to_clients_that_accept_it() {
-        let takes = |value: &str| takes_gzip(&headers("accept-encoding", value));
-        for yes in ["gzip", "gzip, deflate, br", "br, GZIP;q=0.5", "deflate;q=0, gzip; q=1"] {
-            assert!(takes(yes), "{yes}");
-        }
-        for no in ["", "br", "gzip;q=0", "gzip; q=0.0", "x-gzipped"] {
-            assert!(!takes(no), "{no}");
-        }
-        assert!(!takes_gzip(&HeaderMap::new()));
     }
 
     #[test]

@@ -66,11 +66,6 @@ impl<Id> ListQuery<Id> {
     }
 }
 
-/// The query of a route without parameters.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct NoQuery {}
-
 /// The place in a list after which a page begins. Clients see opaque text.
 #[derive(Debug, Clone, Copy, DeserializeFromStr)]
 pub(super) struct Cursor<T>(pub(super) T);

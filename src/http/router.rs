@@ -1,20 +1,17 @@
 //! The routes: the table of contents of the API. `openapi.yaml` has the same ones; a test sees to it.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::error_handling::HandleErrorLayer;
 use axum::extract::DefaultBodyLimit;
 use axum::handler::Handler;
-use axum::http::{HeaderValue, Method};
 use axum::middleware::{from_fn, from_fn_with_state, map_response};
 use axum::routing::{MethodFilter, MethodRouter, on};
 use axum::{BoxError, Router};
 use tower::ServiceBuilder;
 use tower::util::MapRequestLayer;
 use tower_http::catch_panic::CatchPanicLayer;
-use tower_http::cors::{AllowHeaders, CorsLayer};
-use tower_http::request_id::{PropagateRequestIdLayer, SetRequestIdLayer};
+use tower_http::request_id::{MakeRequestUuid, PropagateRequestIdLayer, SetRequestIdLayer};
 use tower_http::trace::TraceLayer;
 
 use super::access::{self, Rule};
@@ -25,13 +22,10 @@ use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
 use super::shares::Places;
 use super::{
     algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
-    layers, me, models, pictures, problems, quality, reference, reports, results, samples, session,
-    submissions, system, tiles, tus,
+    layers, me, models, observation, origins, pictures, problems, quality, reference, reports,
+    results, samples, session, submissions, system, tiles, tus,
 };
 use engine::job::{CalibrationId, MeasurementId, ModelId};
-
-/// Time for which a browser remembers what another origin may do.
-const PREFLIGHT_AGE: Duration = Duration::from_secs(3600);
 
 /// Requests in progress. Two addresses with all their connections do not reach it.
 const MOST_REQUESTS: usize = 4096;
@@ -46,33 +40,33 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/me").get(me::show),
         R::at("/v1/labs").get(labs::list).only(Rule::AllLabs),
         R::at("/v1/labs/{lab}").get(labs::show).patch(labs::change).only(Rule::AllLabs),
-        R::at("/v1/blobs").get(blobs::list).post(blobs::create).uploads(),
-        R::at("/v1/blobs/{sha256}").put(blobs::put).get(blobs::show).delete(blobs::delete).uploads(),
+        R::at("/v1/blobs").get(blobs::list).query().post(blobs::create).uploads(),
+        R::at("/v1/blobs/{sha256}").get(blobs::show).delete(blobs::delete),
         R::at("/v1/blobs/{sha256}/content").get(blobs::content).slow(),
-        R::at("/v1/uploads").get(tus::list).post(tus::create).options(tus::options).tus(),
+        R::at("/v1/uploads").get(tus::list).query().post(tus::create).options(tus::options).tus(),
         R::at("/v1/uploads/{upload}").head(tus::show).patch(tus::patch).delete(tus::delete).tus(),
-        R::at("/v1/calibrations").get(calibrations::list).post(submissions::create::<CalibrationId>).slow(),
+        R::at("/v1/calibrations").get(calibrations::list).query().post(submissions::create::<CalibrationId>).slow(),
         R::at("/v1/calibrations/{calibration}").get(submissions::show::<CalibrationId>).patch(submissions::rename::<CalibrationId>).delete(submissions::delete::<CalibrationId>),
         R::at("/v1/calibrations/{calibration}/masks").get(calibrations::masks).slow(),
         R::at("/v1/calibrations/{calibration}/report").get(reports::json),
-        R::at("/v1/measurements").get(submissions::list::<MeasurementId>).post(submissions::create::<MeasurementId>).slow(),
+        R::at("/v1/measurements").get(submissions::list::<MeasurementId>).query().post(submissions::create::<MeasurementId>).slow(),
         R::at("/v1/measurements/{measurement}").get(submissions::show::<MeasurementId>).patch(submissions::rename::<MeasurementId>).delete(submissions::delete::<MeasurementId>),
-        R::at("/v1/models").get(submissions::list::<ModelId>).post(models::create).slow(),
+        R::at("/v1/models").get(submissions::list::<ModelId>).query().post(models::create).slow(),
         R::at("/v1/models/{model}").get(models::show).patch(submissions::rename::<ModelId>).delete(submissions::delete::<ModelId>),
         R::at("/v1/algorithms").get(algorithms::list),
-        R::at("/v1/jobs").get(jobs::list).post(jobs::create).only(Rule::AcrossLabs),
+        R::at("/v1/jobs").get(jobs::list).query().post(jobs::create).only(Rule::AcrossLabs),
         R::at("/v1/samples").post(samples::create),
         R::at("/v1/jobs/estimate").post(jobs::estimate).changes_nothing(),
         R::at("/v1/jobs/{job}").get(jobs::show).patch(jobs::change).delete(jobs::delete),
         R::at("/v1/jobs/{job}/cancel").post(jobs::cancel),
         R::at("/v1/jobs/{job}/retry").post(jobs::retry),
-        R::at("/v1/jobs/{job}/snapshots").get(results::list),
+        R::at("/v1/jobs/{job}/snapshots").get(results::list).query(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}").get(results::snapshot),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).slow(),
-        R::at("/v1/jobs/{job}/snapshots/{snapshot}/exports/{format}").get(exports::file).slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/quality").get(quality::show).query().slow(),
+        R::at("/v1/jobs/{job}/snapshots/{snapshot}/exports/{format}").get(exports::snapshot_file).query().slow(),
         R::at("/v1/jobs/{job}/snapshots/{snapshot}/exports/{format}/{*path}").get(exports::part).slow(),
         R::at("/v1/jobs/{job}/exports").post(exports::create),
-        R::at("/v1/jobs/{job}/exports/{format}").get(exports::file).slow(),
+        R::at("/v1/jobs/{job}/exports/{format}").get(exports::job_file).slow(),
         R::at("/v1/jobs/{job}/exports/{format}/{*path}").get(exports::part).slow(),
         R::at("/v1/events").get(events::listen).slow(),
         R::at("/v1/system").get(system::show).only(Rule::Admin),
@@ -88,21 +82,21 @@ pub fn routes() -> Vec<Route> {
         R::at("/problems/{code}").get(problems::show).only(Rule::Public),
         R::at("/openapi.yaml").get(contract::yaml).only(Rule::Public),
         R::at("/openapi.json").get(contract::json).only(Rule::Public),
-        R::at("/view/session").post(session::create).delete(session::delete).only(Rule::Own),
-        R::at("/view/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>).slow(),
+        R::at("/view/session").post(session::create).delete(session::delete).query().only(Rule::Own),
+        R::at("/view/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>).query().slow(),
         R::at("/view/calibrations/{calibration}/report.html").get(reports::html),
         R::at("/view/calibrations/{calibration}/maps/{map}").get(reports::map),
-        R::at("/view/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).query().slow(),
         R::at("/view/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>).slow(),
-        R::at("/view/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).query().slow(),
         R::at("/view/calibrations/{calibration}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfCalibration>).slow(),
-        R::at("/view/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).query().slow(),
         R::at("/view/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>).slow(),
-        R::at("/view/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).query().slow(),
         R::at("/view/measurements/{measurement}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfMeasurement>).slow(),
-        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).query().slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>).slow(),
-        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).slow(),
+        R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).query().slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfJob>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/tiles").get(tiles::list),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/tiles/{tile}/history").get(tiles::history),
@@ -126,6 +120,10 @@ pub fn router(app: App) -> Router {
             if route.slow { route.handlers } else { route.handlers.layer(timeout.clone()) };
         let reserve = from_fn_with_state(app.store.clone(), layers::delete_with_reserve);
         let record = from_fn_with_state((app.audit.clone(), route.path), audit::record);
+        let closed = from_fn_with_state(route.queries, layers::closed_query);
+        // The guard takes `lab` out of the query. Browsers and probes add parameters to the address of a public route.
+        let handlers =
+            if route.rule == Rule::Public { handlers } else { handlers.route_layer(closed) };
         let handlers = handlers.route_layer(reserve).route_layer(guard);
         let handlers = if route.is_pure { handlers } else { handlers.route_layer(record) };
         let handlers = if route.uploads { handlers.layer(close.clone()) } else { handlers };
@@ -134,19 +132,19 @@ pub fn router(app: App) -> Router {
         let handlers = if is_probe { handlers } else { handlers.layer(shedding.clone()) };
         router = router.route(route.path, handlers);
     }
-    let origins = cors(&app.settings.cors_origins);
+    let cors = origins::cors(&app.settings.cors_origins);
     let [sniffing, referrer, framing] = layers::restrictions();
     let trace = TraceLayer::new_for_http()
-        .make_span_with(layers::span)
+        .make_span_with(observation::span)
         .on_request(())
         .on_response(())
         .on_failure(());
     let observation = ServiceBuilder::new()
-        .layer(MapRequestLayer::new(layers::without_odd_id))
-        .layer(SetRequestIdLayer::x_request_id(layers::NewId))
+        .layer(MapRequestLayer::new(observation::without_odd_id))
+        .layer(SetRequestIdLayer::x_request_id(MakeRequestUuid))
         .layer(PropagateRequestIdLayer::x_request_id())
         .layer(trace)
-        .layer(from_fn(layers::observe));
+        .layer(from_fn(observation::observe));
     let router = router
         .fallback(layers::not_found)
         .method_not_allowed_fallback(layers::method_not_allowed)
@@ -156,32 +154,16 @@ pub fn router(app: App) -> Router {
         .layer(from_fn(layers::one_host))
         .layer(from_fn(layers::relative_references))
         .layer(ServiceBuilder::new().layer(sniffing).layer(referrer).layer(framing))
+        .layer(layers::compression())
+        .layer(from_fn(layers::encoded_tags))
         .layer(observation)
         .with_state(app);
     // Around the routes: what changes the method or the path of a request.
     let rewritten = ServiceBuilder::new().layer(MapRequestLayer::new(tus::rewrite)).service(router);
-    match origins {
-        Some(cors) => Router::new().fallback_service(layers::cors(cors, rewritten)),
+    match cors {
+        Some(cors) => Router::new().fallback_service(origins::with_cors(cors, rewritten)),
         None => Router::new().fallback_service(rewritten),
     }
-}
-
-/// Lets pages of these origins use the API with a token; none without origins.
-fn cors(origins: &[HeaderValue]) -> Option<CorsLayer> {
-    let cors = CorsLayer::new()
-        .allow_origin(origins.to_vec())
-        .allow_methods([
-            Method::GET,
-            Method::HEAD,
-            Method::POST,
-            Method::PUT,
-            Method::PATCH,
-            Method::DELETE,
-        ])
-        .allow_headers(AllowHeaders::mirror_request())
-        .expose_headers(layers::exposed())
-        .max_age(PREFLIGHT_AGE);
-    (!origins.is_empty()).then_some(cors)
 }
 
 /// A path with its methods and handlers.
@@ -192,6 +174,8 @@ pub struct Route {
     /// The methods as they stand in the contract, in lower case.
     pub methods: Vec<&'static str>,
     handlers: MethodRouter<App>,
+    /// The methods whose handlers read the query.
+    queries: Vec<&'static str>,
     pub(super) rule: Rule,
     slow: bool,
     uploads: bool,
@@ -204,6 +188,7 @@ impl Route {
             path,
             methods: Vec::new(),
             handlers: MethodRouter::new(),
+            queries: Vec::new(),
             rule: Rule::ByMethod,
             slow: false,
             uploads: false,
@@ -230,10 +215,6 @@ impl Route {
         self.method("post", MethodFilter::POST, handler)
     }
 
-    fn put<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
-        self.method("put", MethodFilter::PUT, handler)
-    }
-
     fn patch<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
         self.method("patch", MethodFilter::PATCH, handler)
     }
@@ -249,6 +230,12 @@ impl Route {
 
     fn delete<H: Handler<T, App>, T: 'static>(self, handler: H) -> Self {
         self.method("delete", MethodFilter::DELETE, handler)
+    }
+
+    /// The handlers up to here read the query. Any query that another handler gets is refused.
+    fn query(mut self) -> Self {
+        self.queries.clone_from(&self.methods);
+        self
     }
 
     /// For others than those who read or submit data of a lab.

@@ -73,10 +73,12 @@ impl<Holder: Eq + Hash + Clone> Places<Holder> {
         let gets_its_first = own == 0 && self.always_one;
         if !gets_its_first && (own >= share || all >= self.most) {
             let held = if own >= share { own } else { all };
-            return Err(Full { seconds: taken.turnover.next_end(held) });
+            return Err(Full { seconds: taken.turnover.next_end(held, Instant::now()) });
         }
         *taken.by_holder.entry(holder.clone()).or_default() += 1;
-        Ok(Place { places: self.clone(), holder: holder.clone(), since: Instant::now() })
+        let since = Instant::now();
+        taken.turnover.begin(since);
+        Ok(Place { places: self.clone(), holder: holder.clone(), since })
     }
 }
 

@@ -14,7 +14,7 @@ use super::app::App;
 use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Problem, REQUEST_ID, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
-use super::page::{Limit, ListQuery, NoQuery, PageBody, Renaming};
+use super::page::{Limit, ListQuery, PageBody, Renaming};
 use engine::job::{CheckLimits, InvalidId, JobState, Lab, Submission, ThingId};
 use store::{
     Asked, Filter, Inserted, Made, NewRequest, Page, Request, RequestKey, Resource, StoreError,
@@ -93,7 +93,6 @@ pub(super) async fn page<Id: Shown>(
 pub(super) async fn show<Id: Shown>(
     Caller(app, access): Caller,
     Params(id): Params<Id>,
-    QueryOf(NoQuery {}): QueryOf<NoQuery>,
     request: RequestContext,
 ) -> Result<Response> {
     let wait = request.wait();

@@ -4,10 +4,19 @@
 #
 #   tests/judges/dist.sh dist/sci-recon-VERSION-x86_64-linux.tar.gz
 #
+# The folder of the archive has its list of components, the Python client and SHA256SUMS, too.
 # Needs root (chroot), apt-get, curl and jq. The last line of the output is JSON.
 set -euo pipefail
 archive=$(realpath "$1")
 [ "$(id -u)" = 0 ] || { echo "chroot is for root" >&2; exit 2; }
+folder=$(dirname "$archive")
+(cd "$folder" && sha256sum --check --strict --quiet SHA256SUMS)
+for file in "$archive" "${archive%.tar.gz}.cdx.json" "$folder"/*.whl; do
+  grep -q " $(basename "$file")\$" "$folder/SHA256SUMS" || { echo "SHA256SUMS lacks $file" >&2; exit 1; }
+done
+components=$(jq '[select(.bomFormat == "CycloneDX") | .components[] | select(.name and .version and .purl)] | length' \
+  "${archive%.tar.gz}.cdx.json")
+[ "$components" -gt 100 ] || { echo "the list of components has $components" >&2; exit 1; }
 root=$(mktemp -d)
 server=
 trap 'kill $server 2>/dev/null && wait $server; umount -q "$root/proc" || true; rm -rf "$root"' EXIT
@@ -61,5 +70,5 @@ fetched=$(find "$root/lab/out" -name frames.npy -size +0 | wc -l)
 kill $server && wait $server
 server=
 jq --compact-output --null-input --arg version "$version" --argjson start_ms $up --argjson job_ms $took \
-  --argjson archive_bytes "$(stat -c %s "$archive")" --argjson frames_bytes "$(stat -c %s "$root/lab/frames.npy")" \
-  '{target: "dist", ok: true, $version, $start_ms, $job_ms, $archive_bytes, $frames_bytes}'
+  --argjson components "$components" --argjson archive_bytes "$(stat -c %s "$archive")" --argjson frames_bytes "$(stat -c %s "$root/lab/frames.npy")" \
+  '{target: "dist", ok: true, $version, $start_ms, $job_ms, $components, $archive_bytes, $frames_bytes}'

@@ -72,7 +72,7 @@ class Image:
             elif name == "HEALTHCHECK":
                 self.health = json.loads(rest[rest.index("CMD") + 3:])
             else:
-                require(name in ("VOLUME", "EXPOSE", "STOPSIGNAL", "CMD", "LABEL"), f"{name} is not known here")
+                require(name in ("ARG", "VOLUME", "EXPOSE", "STOPSIGNAL", "CMD", "LABEL"), f"{name} is not known here")
 
     def run(self, words):
         if words[0] in ("apt-get", "rm"):

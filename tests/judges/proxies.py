@@ -1,7 +1,8 @@
 """Uses the service behind the samples for nginx and Caddy, at the root of a site and below /sci/.
 
 tuspy, tus-js-client and Uppy (from a page of another origin) upload. A job runs, and its result, the dashboard, the cookie
-of its session and all references in headers hold below the prefix.
+of its session and all references in headers hold below the prefix. The clients that `make clients` has generated do a round
+trip below the prefix.
 """
 
 import contextlib
@@ -87,6 +88,10 @@ def behind_caddy(root, wrong, folder, service):
 
 
 PROXIES = {"nginx": behind_nginx, "caddy": behind_caddy}
+CLIENTS = {
+    "python": ["{clients}/python/bin/python", "{clients}/generated/round_trip.py"],
+    "typescript": ["node", "{clients}/generated/round_trip.mjs"],
+}
 
 
 def proxies(root, wrong, program, tools):
@@ -132,6 +137,8 @@ def one_proxy(root, wrong, program, tools, proxy, browser):
             token = subprocess.check_output(line, text=True).strip()
             for address in addresses:
                 walk(address, token, (folder, tools))
+            for client in CLIENTS:
+                round_trip(client, tools, addresses[-1], token, folder)
             if browser:
                 environment = {**os.environ, "CHROMIUM": browser}
                 upload(["node", tools / "uppy.mjs", str(page)], addresses[-1], token, scene(folder)[0], environment)
@@ -186,6 +193,17 @@ def upload(command, address, token, file, environment=None):
     assert done.returncode == 0, f"{command[1].name} at {address}: {done.stdout} {done.stderr}"
     assert done.stdout.startswith(f"{address}v1/uploads/"), f"{command[1].name} at {address}: {done.stdout}"
     stored(address, token, file)
+
+
+def round_trip(client, tools, address, token, folder):
+    """Reconstructs a new scene with a generated client."""
+    clients = tools.parent / "clients"
+    environment = {**os.environ, "PYTHONPATH": str(clients / "generated/client"), "CERTIFICATE": f"{folder}/cert.pem"}
+    line = [part.format(clients=clients) for part in CLIENTS[client]]
+    line += [address if client == "python" else address.rstrip("/"), token, *map(str, scene(folder))]
+    done = subprocess.run(line, capture_output=True, timeout=180, env=environment)
+    assert done.returncode == 0, f"the {client} client at {address}: {done.stderr.decode()}"
+    assert np.load(io.BytesIO(done.stdout)).shape == (4, 48, 64), f"the {client} client at {address}"
 
 
 def stored(address, token, file):

@@ -90,6 +90,8 @@ async fn a_role_allows_its_actions_and_no_others() {
     app.get(&format!("/v1/jobs/{job}")).await.expect(200);
     app.post("/v1/jobs", &body).await.problem(403, "forbidden");
     app.delete(&format!("/v1/jobs/{job}")).await.problem(403, "forbidden");
+    let movie = app.post(&format!("/v1/jobs/{job}/exports"), &json!({"format": "mp4"})).await;
+    movie.problem(403, "forbidden");
     let upload = app.send(app.request(Method::POST, "/v1/blobs").body("x")).await;
     assert!(upload.problem(403, "forbidden").contains("submit"));
     assert_eq!(upload.header("connection"), "close");

@@ -8,7 +8,9 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use crate::app::TestApp;
+use crate::app::{TestApp, id};
+use crate::contract::matches_schema;
+use crate::learned;
 use crate::samples::Scene;
 
 #[tokio::test]
@@ -41,25 +43,8 @@ async fn every_resource_has_an_etag_and_every_change_a_condition() {
         let known = app.request(Method::GET, path).header("if-none-match", &etag);
         app.send(known).await.expect(304);
     }
-    for path in &singles[..] {
-        let etag = app.get(path).await.header("etag").to_owned();
-        let body = match path {
-            _ if path.contains("labs") => json!({"share": 2.0}),
-            _ if path.contains("jobs") => json!({"label": "other"}),
-            _ => json!({"name": "other"}),
-        };
-        let change =
-            |tag: &str| app.request(Method::PATCH, path).header("if-match", tag).json(&body);
-        if !path.contains("blobs") {
-            app.send(change("\"old\"")).await.problem(412, "precondition_failed");
-            let changed = app.send(change(&etag)).await.expect(200);
-            assert_eq!(changed.header("etag"), app.get(path).await.header("etag"), "{path}");
-            app.send(change(&etag)).await.problem(412, "precondition_failed");
-        }
-        if !path.contains("labs") {
-            let delete = app.request(Method::DELETE, path).header("if-match", "\"old\"");
-            app.send(delete).await.problem(412, "precondition_failed");
-        }
+    for path in &singles {
+        check_conditions(&app, path).await;
     }
     app.post(&format!("/v1/jobs/{job}/cancel"), &json!({})).await.expect(202);
     for path in &singles[..4] {
@@ -79,6 +64,43 @@ async fn every_resource_has_an_etag_and_every_change_a_condition() {
         .await
         .problem(412, "precondition_failed");
     app.send(tus(Method::DELETE)).await.expect(204);
+}
+
+/// Changes a resource, and fails unless each change and its deletion honour `If-Match`.
+async fn check_conditions(app: &TestApp, path: &str) {
+    let etag = app.get(path).await.header("etag").to_owned();
+    let body = match path {
+        _ if path.contains("labs") => json!({"share": 2.0}),
+        _ if path.contains("jobs") => json!({"label": "other"}),
+        _ => json!({"name": "other"}),
+    };
+    let change = |tag: &str| app.request(Method::PATCH, path).header("if-match", tag).json(&body);
+    if !path.contains("blobs") {
+        app.send(change("\"old\"")).await.problem(412, "precondition_failed");
+        let changed = app.send(change(&etag)).await.expect(200);
+        assert_eq!(changed.header("etag"), app.get(path).await.header("etag"), "{path}");
+        app.send(change(&etag)).await.problem(412, "precondition_failed");
+    }
+    if !path.contains("labs") {
+        let delete = app.request(Method::DELETE, path).header("if-match", "\"old\"");
+        app.send(delete).await.problem(412, "precondition_failed");
+    }
+}
+
+#[tokio::test]
+async fn a_model_has_an_etag_and_its_changes_have_a_condition() {
+    let Some(python) = learned::python() else { return };
+    let (folder, scene) = (tempfile::tempdir().unwrap(), Scene::SMALL);
+    let network = learned::train(&python, folder.path(), scene, "free");
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let calibration = id(&app.calibrate(scene.masks()).await.expect(201));
+    let model = id(&learned::register(&app, &calibration, &network).await.expect(201));
+    let path = format!("/v1/models/{model}");
+    check_conditions(&app, &path).await;
+    let etag = app.get(&path).await.header("etag").to_owned();
+    let known = app.request(Method::GET, &path).header("if-none-match", &etag);
+    app.send(known).await.expect(304);
+    app.send(app.request(Method::DELETE, &path).header("if-match", etag)).await.expect(204);
 }
 
 #[tokio::test]
@@ -196,8 +218,10 @@ async fn references_hold_below_a_prefix() {
         response.url().join(place).unwrap()
     };
     // Uploads in pieces.
-    let created = http.post(format!("{base}/v1/uploads/")).header("tus-resumable", "1.0.0");
-    let created = created.header("upload-length", "3").send().await.unwrap();
+    let created = http.get(format!("{base}/v1/uploads/")).header("tus-resumable", "1.0.0");
+    // The service ignores the actual method.
+    let created = created.header("x-http-method-override", "POST").header("upload-length", "3");
+    let created = created.send().await.unwrap();
     assert_eq!(created.status(), 201);
     let place = follow(&created, "location");
     assert!(place.as_str().starts_with(&format!("{base}/v1/uploads/")), "{place}");
@@ -355,6 +379,37 @@ async fn log_lines_name_the_trace_of_the_caller() {
     assert_eq!(line("alone")["span"]["trace_id"], Value::Null);
 }
 
+#[cfg(feature = "otel")]
+#[tokio::test]
+async fn a_collector_gets_the_span_of_a_request() {
+    use std::io::{Read, Write};
+
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    let (sender, collected) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        let (mut socket, _) = listener.accept().unwrap();
+        let (mut received, mut part) = (Vec::new(), [0; 4096]);
+        // The spans follow the name of the service.
+        while !received.windows(9).any(|bytes| bytes == b"sci-recon") {
+            let count = socket.read(&mut part).unwrap();
+            received.extend_from_slice(&part[..count]);
+        }
+        socket.write_all(b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n").unwrap();
+        sender.send(received).unwrap();
+    });
+    let environment = [("OTEL_EXPORTER_OTLP_ENDPOINT", endpoint.as_str()), ("RUST_LOG", "info")];
+    let mut app = TestApp::in_environment(&["--workers", "0"], &environment).await;
+    let trace = "4bf92f3577b34da6a3ce929d0e0e4736";
+    let request = app.request(Method::GET, "/v1/me");
+    app.send(request.header("traceparent", format!("00-{trace}-00f067aa0ba902b7-01"))).await;
+    assert!(app.stop().success());
+    let received = collected.recv_timeout(Duration::from_secs(60)).expect("the spans come");
+    assert!(received.starts_with(b"POST /v1/traces "), "{:?}", String::from_utf8_lossy(&received));
+    let trace = hex::decode(trace).unwrap();
+    assert!(received.windows(16).any(|bytes| bytes == trace), "the span continues the trace");
+}
+
 #[tokio::test]
 async fn a_token_has_a_rate() {
     let app = TestApp::with(&["--workers", "0", "--requests-per-minute", "20"]).await;
@@ -419,4 +474,88 @@ async fn events_go_on_after_a_cut() {
         let chunk = events.chunk().await.unwrap().unwrap();
         assert!(chunk.starts_with(b"event: hello"), "{unknown}: {chunk:?}");
     }
+}
+
+/// The next blocks of a stream of events, each with its name, id and data.
+async fn blocks(events: &mut Response, count: usize) -> Vec<[String; 3]> {
+    let mut all = String::new();
+    while all.matches("\n\n").count() < count || !all.ends_with("\n\n") {
+        let chunk = tokio::time::timeout(Duration::from_secs(20), events.chunk()).await;
+        all += std::str::from_utf8(&chunk.expect("an event").unwrap().expect("no end")).unwrap();
+    }
+    let field = |block: &str, name: &str| {
+        let mut lines = block.lines().filter_map(|line| line.strip_prefix(name));
+        lines.next().unwrap_or_else(|| panic!("no {name:?} in {block:?}")).to_owned()
+    };
+    let blocks = all.split_terminator("\n\n");
+    blocks.map(|block| ["event: ", "id: ", "data: "].map(|name| field(block, name))).collect()
+}
+
+#[tokio::test]
+async fn every_event_has_an_id_from_which_a_client_goes_on() {
+    let app = TestApp::start().await;
+    let listen = async |last: Option<&str>| {
+        let request = app.request(Method::GET, "/v1/events");
+        let request =
+            last.iter().fold(request, |request, last| request.header("last-event-id", *last));
+        request.send().await.unwrap()
+    };
+    let [[name, start, hello]] = &blocks(&mut listen(None).await, 1).await[..] else {
+        panic!("one event")
+    };
+    assert_eq!(name, "hello");
+    let hello: Value = serde_json::from_str(hello).unwrap();
+    assert!(matches_schema("Change", &hello), "{hello}");
+    assert_eq!(hello["more"], true, "the client reads the lists");
+    let (calibration, measurement) = app.scene(&Scene::SMALL).await;
+    let job = app.submit(&json!({"measurement": measurement, "algorithm": "gap-tv"})).await;
+    let missed = blocks(&mut listen(Some(start)).await, 3).await;
+    let names = ["jobs", "calibrations", "measurements"];
+    for ((name, id), [event, _, data]) in
+        names.iter().zip([job, calibration, measurement]).zip(&missed)
+    {
+        assert!(event == name && data.contains(&id), "{missed:?}");
+        assert!(matches_schema("Change", &serde_json::from_str(data).unwrap()), "{data}");
+    }
+    // A client that has the first two alone gets all of them again, one that has the last gets none.
+    for [_, id, _] in &missed[..2] {
+        assert_eq!(blocks(&mut listen(Some(id)).await, 3).await, missed);
+    }
+    let mut events = listen(Some(&missed[2][1])).await;
+    assert!(tokio::time::timeout(Duration::from_secs(2), events.chunk()).await.is_err());
+}
+
+#[tokio::test]
+async fn a_full_queue_names_the_time_until_a_job_ends() {
+    let app = TestApp::with(&["--workers", "1", "--max-jobs", "2"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv", "schedule": {"stages": [
+        {"prior": "tv", "iterations": 10_000, "tv_weight": 0.05, "tv_updates": 40}]}});
+    let jobs = [app.submit(&body).await, app.submit(&body).await];
+    let path = |job: &str| format!("/v1/jobs/{job}");
+    while app.get(&path(&jobs[0])).await.json()["state"] != "running" {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    // The time for both jobs, which end one after the other.
+    let both = async || {
+        let last = app.get(&path(&jobs[1])).await.json();
+        last["progress"]["eta_seconds"].as_f64().unwrap()
+    };
+    let before = both().await;
+    let full = app.post("/v1/jobs", &body).await;
+    full.problem(429, "queue_full");
+    let seconds: f64 = full.header("retry-after").parse().unwrap();
+    let after = both().await;
+    let (least, most) = (before.min(after) / 2.0, before.max(after) / 2.0);
+    let expected = least.min(600.0).floor().max(1.0)..=most.min(600.0).ceil().max(1.0);
+    assert!(expected.contains(&seconds), "{seconds} is not in {expected:?}");
+    // A job that waits is cancelled at once. Its next turn is when its predecessor has ended.
+    let cancelled = app.post(&format!("{}/cancel", path(&jobs[1])), &json!({})).await.expect(202);
+    assert_eq!(
+        (&cancelled.json()["state"], cancelled.header("retry-after")),
+        (&json!("cancelled"), "")
+    );
+    let again = app.post(&format!("{}/retry", path(&jobs[1])), &json!({})).await.expect(202);
+    let eta = again.json()["progress"]["eta_seconds"].as_f64().unwrap();
+    assert_eq!(again.header("retry-after"), eta.clamp(1.0, 600.0).ceil().to_string());
 }

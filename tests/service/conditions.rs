@@ -47,26 +47,22 @@ async fn a_body_must_match_its_headers() {
     let app = TestApp::start().await;
     let post = || app.request(Method::POST, "/v1/blobs").body("abc");
     let hash = sha256(b"abc");
-    let put = || app.request(Method::PUT, &format!("/v1/blobs/{hash}")).body("abc");
-    for (name, value) in [("content-encoding", "gzip"), ("content-encoding", "identity, br")] {
-        for request in [post(), put()] {
-            let refused = app.send(request.header(name, value)).await;
-            assert!(
-                refused.problem(415, "unsupported_media_type").contains("gzip") || value != "gzip"
-            );
-            assert_eq!(refused.header("accept-encoding"), "identity");
-        }
+    for encoding in ["gzip", "identity, br"] {
+        let refused = app.send(post().header("content-encoding", encoding)).await;
+        let detail = refused.problem(415, "unsupported_media_type");
+        assert!(detail.contains("gzip") || encoding != "gzip", "{detail}");
+        assert_eq!(refused.header("accept-encoding"), "identity");
     }
     let digest = |request: RequestBuilder, value: &str| request.header("content-digest", value);
-    app.send(digest(post(), OTHER)).await.problem(422, "hash_mismatch");
-    app.send(digest(put(), OTHER)).await.problem(422, "hash_mismatch");
+    let detail = app.send(digest(post(), OTHER)).await.problem(422, "hash_mismatch");
+    assert!(detail.contains(&hash), "{detail}");
     for unchecked in ["sha-256=:x:", "sha-512=:AA==:", "SHA-256=:AA==:", "nonsense", ""] {
         let refused = app.send(digest(post(), unchecked)).await;
         assert!(refused.problem(400, "malformed_request").contains("sha-256=:"), "{unchecked}");
     }
     app.get(&format!("/v1/blobs/{hash}")).await.problem(404, "not_found");
     app.send(digest(post(), &format!("sha-512=:AA==:, {ABC}"))).await.expect(201);
-    app.send(digest(put(), ABC)).await.expect(200);
+    app.send(digest(post(), ABC)).await.expect(200);
     let json = |value: &str| {
         let request = app.request(Method::POST, "/v1/calibrations").json(&json!({"masks": hash}));
         digest(request, value)
@@ -96,7 +92,7 @@ async fn a_busy_database_is_reported_as_temporary() {
     let lock = database.begin_with("BEGIN IMMEDIATE").await.unwrap();
     let busy = app.send(app.request(Method::POST, "/v1/blobs").body("abc")).await;
     busy.problem(503, "unavailable");
-    assert!(!busy.header("retry-after").is_empty());
+    assert_eq!(busy.header("retry-after"), "15", "the lock has been held for as long");
     lock.rollback().await.unwrap();
     app.upload(b"abc".to_vec()).await;
 }

@@ -99,6 +99,8 @@ async fn empty_announcements_do_not_exhaust_the_disk() {
         announced += 1;
     };
     assert!(refused.problem(429, "too_many_uploads").contains("64"));
+    // The first one expires in an hour.
+    assert_eq!(refused.header("retry-after"), "600");
     assert_eq!(announced, 64);
     app.sign_in(&b);
     app.send(announce(&app, 10)).await.expect(201);

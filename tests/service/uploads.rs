@@ -19,8 +19,6 @@ async fn a_file_is_stored_once_under_its_hash() {
     assert_eq!(first.json()["size"], 3);
     assert_eq!(first.header("location"), format!("/v1/blobs/{ABC}"));
     assert_eq!(app.send(post()).await.expect(200).json(), first.json());
-    let put = app.request(Method::PUT, &format!("/v1/blobs/{ABC}")).body("abc");
-    app.send(put).await.expect(200);
     let form = multipart::Form::new()
         .text("note", "before the file")
         .part("file", multipart::Part::bytes(b"abc".to_vec()).file_name("../../etc/passwd"));
@@ -35,17 +33,11 @@ async fn a_file_is_stored_once_under_its_hash() {
 #[tokio::test]
 async fn a_bad_upload_is_rejected_with_the_reason_and_leaves_no_file() {
     let app = TestApp::with(&["--workers", "0", "--max-upload-bytes", "100000"]).await;
-    let put = |body: &'static str| app.request(Method::PUT, &format!("/v1/blobs/{ABC}")).body(body);
-    let detail = app.send(put("abd")).await.problem(422, "hash_mismatch");
-    assert!(detail.contains(ABC), "{detail}");
-    // A part of a file must not be stored as a file.
-    let part = |request: reqwest::RequestBuilder| request.header("content-range", "bytes 0-2/9");
-    for request in [put("abc"), app.request(Method::POST, "/v1/blobs").body("abc")] {
-        let detail = app.send(part(request)).await.problem(400, "malformed_request");
-        assert!(detail.contains("/v1/uploads"), "{detail}");
-    }
-    app.send(put("")).await.problem(400, "empty_body");
     let post = |body: Body| app.request(Method::POST, "/v1/blobs").body(body);
+    // A part of a file must not be stored as a file.
+    let part = post(Body::from("abc")).header("content-range", "bytes 0-2/9");
+    let detail = app.send(part).await.problem(400, "malformed_request");
+    assert!(detail.contains("/v1/uploads"), "{detail}");
     app.send(post(Body::from(""))).await.problem(400, "empty_body");
     app.send(post(Body::from(vec![0; 100_001]))).await.problem(413, "too_large");
     // Without a Content-Length, the limit applies to the bytes received.
@@ -131,8 +123,10 @@ async fn too_many_concurrent_uploads_are_asked_to_retry() {
         second.header("retry-after").parse::<u64>().unwrap()
     };
     let mut first = begin().await;
-    assert_eq!(refused().await, 5, "no upload has ended yet");
+    assert!(refused().await < 7, "the first upload has just begun");
     tokio::time::sleep(Duration::from_secs(7)).await;
+    let seconds = refused().await;
+    assert!((7..30).contains(&seconds), "none has ended, and the first has taken 7 s: {seconds}");
     first.write_all(b"0123456789").await.unwrap();
     let (mut answer, mut part) = (String::new(), vec![0; 1000]);
     while !answer.contains("HTTP/1.1 201") {

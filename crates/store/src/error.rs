@@ -1,9 +1,13 @@
 //! Errors of the store.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use engine::job::IllegalTransition;
 use formats::DiskTrouble;
+
+/// Longest wait of a change for another connection that holds the lock of the database.
+pub(crate) const BUSY_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// Result codes of SQLite.
 const BUSY: u32 = 5;
@@ -112,11 +116,12 @@ pub enum StoreError {
     QueueFull { whose: &'static str, jobs: u64, most: u64 },
     #[error("it needs {needed} bytes, and the {whose} keeps {kept} of the {limit} it may")]
     Quota { whose: &'static str, kept: u64, needed: u64, limit: u64 },
-    #[error("{0} uploads of this lab are not complete; end some before another is begun")]
-    ManyPartials(u64),
-    /// A lab has enough checks that wait or run. `mean_seconds` is the mean time of those that have ended.
+    /// A lab has enough incomplete uploads. The first of them expires in `seconds`.
+    #[error("{uploads} uploads of this lab are not complete; end some before another is begun")]
+    ManyPartials { uploads: u64, seconds: f64 },
+    /// A lab has enough checks that wait or run. One of them takes about `seconds`.
     #[error("{checks} files of this lab wait to be checked; try again when some are done")]
-    ManyChecks { checks: u64, mean_seconds: Option<f64> },
+    ManyChecks { checks: u64, seconds: f64 },
     /// The disk has no room for something that is about to be written.
     #[error(
         "{what} needs {needed} bytes; {free} are free, of which {promised} are promised to others and {reserve} \
@@ -181,6 +186,16 @@ impl StoreError {
             Self::Database(sqlx::Error::PoolTimedOut) => true,
             Self::Database(error) => matches!(sqlite_code(error), Some(BUSY | LOCKED)),
             _ => false,
+        }
+    }
+
+    /// Estimated seconds after which the same request may succeed.
+    pub fn retry_seconds(&self) -> Option<f64> {
+        match self {
+            Self::ManyPartials { seconds, .. } | Self::ManyChecks { seconds, .. } => Some(*seconds),
+            // The lock has been held for that long, and is expected to be held as long again.
+            busy if busy.is_busy() => Some(BUSY_TIMEOUT.as_secs_f64()),
+            _ => None,
         }
     }
 

@@ -12,7 +12,7 @@
 //! refer to is not deleted (`InUse`). Their descriptions name only what else can go wrong.
 
 use crate::columns::{sql, sql_as};
-use crate::error::Result;
+use crate::error::{BUSY_TIMEOUT, Result};
 mod backup;
 mod cleaning;
 mod clock;
@@ -123,7 +123,7 @@ impl Store {
             .filename(dir.database())
             .create_if_missing(serves)
             .foreign_keys(true)
-            .busy_timeout(Duration::from_secs(15))
+            .busy_timeout(BUSY_TIMEOUT)
             .journal_mode(SqliteJournalMode::Wal)
             // Rows of jobs and tasks have one to two kilobytes. In smaller pages they would overflow.
             .page_size(8192)

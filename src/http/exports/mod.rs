@@ -21,7 +21,7 @@ use engine::job::MovieFormat;
 use format::Format;
 pub(super) use movie::create;
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ExportQuery {
     /// Additional layers of an EXR.
@@ -35,14 +35,22 @@ enum Layer {
     Sigma,
 }
 
-/// Sends an export that is a single file.
-pub(super) async fn file(
-    clip: Clip,
+/// Sends an export of a snapshot that is a single file.
+pub(super) async fn snapshot_file(
     QueryOf(query): QueryOf<ExportQuery>,
+    clip: Clip,
     method: Method,
     headers: HeaderMap,
 ) -> Result<Response> {
-    let request = (&method, &headers);
+    file(clip, query, (&method, &headers)).await
+}
+
+/// Sends an export of a whole job that is a single file.
+pub(super) async fn job_file(clip: Clip, method: Method, headers: HeaderMap) -> Result<Response> {
+    file(clip, ExportQuery::default(), (&method, &headers)).await
+}
+
+async fn file(clip: Clip, query: ExportQuery, request: (&Method, &HeaderMap)) -> Result<Response> {
     if query.layers.is_some() && clip.format != Format::Exr {
         return Err(ApiError::new(
             Code::InvalidQuery,

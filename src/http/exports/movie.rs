@@ -9,16 +9,13 @@ use serde_json::Value;
 
 use super::super::app::App;
 use super::super::download::Download;
-use super::super::error::{ApiError, Code, Result};
+use super::super::error::{ApiError, Code, MAX_RETRY_SECONDS, Result, retry_seconds};
 use super::super::extract::{Body, Caller, Params};
 use super::super::results::{file_name, media_type, white_level};
 use super::clip::Clip;
 use engine::job::{JobId, MIN_MOVIE_SIDE, MovieFormat};
 use engine::pipeline::movie::DisplayWindow;
 use store::{Movie, StoreError};
-
-/// Seconds between two requests of a client that waits for a movie.
-const RETRY_SECONDS: HeaderValue = HeaderValue::from_static("1");
 
 /// The body of `POST /v1/jobs/{job}/exports`.
 #[derive(Debug, Deserialize)]
@@ -69,16 +66,15 @@ pub(in crate::http) async fn create(
     let clip = Clip { app, job, snapshot, format: format.into() };
     check(&clip, format).await?;
     let window = requested_window(&clip.app, id, black, white).await?;
-    let (status, body) =
-        match clip.app.store.create_movie(&clip.job, (snapshot, format), &window).await? {
-            Movie::Ready { .. } => {
-                (StatusCode::OK, ExportBody { state: ExportState::Ready, percent: 100.0 })
-            }
-            Movie::Asked(fraction) => (StatusCode::ACCEPTED, pending(fraction)),
-            Movie::Failed(reason) => return Err(failed(&reason)),
-        };
-    Ok((status, [(header::LOCATION, address)], [(header::RETRY_AFTER, RETRY_SECONDS)], Json(body))
-        .into_response())
+    let movie = clip.app.store.create_movie(&clip.job, (snapshot, format), &window).await?;
+    let answer = match movie {
+        Movie::Ready { .. } => {
+            Json(ExportBody { state: ExportState::Ready, percent: 100.0 }).into_response()
+        }
+        Movie::Asked(fraction) => pending(&clip, format, fraction).await?,
+        Movie::Failed(reason) => return Err(failed(&reason)),
+    };
+    Ok(([(header::LOCATION, address)], answer).into_response())
 }
 
 /// The movie in a format, at ten frames per second.
@@ -102,11 +98,8 @@ pub(super) async fn movie(
             download.send(async { Ok(file) }, request).await
         }
         Some(Movie::Asked(fraction)) => {
-            let fields = [
-                (header::RETRY_AFTER, RETRY_SECONDS),
-                (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
-            ];
-            Ok((StatusCode::ACCEPTED, fields, Json(pending(fraction))).into_response())
+            let uncached = [(header::CACHE_CONTROL, HeaderValue::from_static("no-store"))];
+            Ok((uncached, pending(&clip, format, fraction).await?).into_response())
         }
         Some(Movie::Failed(reason)) => Err(failed(&reason)),
         None => Err(missing(format)),
@@ -148,9 +141,17 @@ async fn requested_window(
     serde_json::to_value(window).map_err(|error| ApiError::internal(&error))
 }
 
-fn pending(fraction: Option<f64>) -> ExportBody {
+/// Answers 202 for a movie that is being made, with an estimate of the seconds until it is ready. `fraction` is the share
+/// that is done.
+async fn pending(clip: &Clip, format: MovieFormat, fraction: Option<f64>) -> Result<Response> {
     let state = if fraction.is_some() { ExportState::Running } else { ExportState::Waiting };
-    ExportBody { state, percent: (fraction.unwrap_or(0.0) * 1000.0).round() / 10.0 }
+    let percent = (fraction.unwrap_or(0.0) * 1000.0).round() / 10.0;
+    let movie = (clip.snapshot, format);
+    let estimate = clip.app.store.movie_seconds(&clip.job, movie, fraction).await?;
+    // Without a worker, it does not become ready.
+    let seconds = retry_seconds(estimate.unwrap_or(MAX_RETRY_SECONDS));
+    let retry_after = [(header::RETRY_AFTER, HeaderValue::from(seconds))];
+    Ok((StatusCode::ACCEPTED, retry_after, Json(ExportBody { state, percent })).into_response())
 }
 
 fn missing(format: MovieFormat) -> ApiError {

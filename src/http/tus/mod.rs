@@ -35,20 +35,23 @@ const EXPIRES: HeaderName = HeaderName::from_static("upload-expires");
 const EXTENSIONS: &str = "creation,creation-defer-length,checksum,expiration,termination";
 const VERSION: HeaderValue = HeaderValue::from_static("1.0.0");
 
-/// Rewrites a request by the rules of tus. `X-HTTP-Method-Override` replaces the method, for clients that can send only
-/// POST. The trailing slash of `/v1/uploads/` is removed.
+/// Rewrites a request by the rules of tus. `X-HTTP-Method-Override` replaces the method, whatever that is. The trailing
+/// slash of `/v1/uploads/` is removed.
 pub(super) fn rewrite(mut request: Request) -> Request {
     let path = request.uri().path();
+    if path != "/v1/uploads" && !path.starts_with("/v1/uploads/") {
+        return request;
+    }
     if path == "/v1/uploads/" {
         let query = request.uri().query().map_or(String::new(), |query| format!("?{query}"));
         if let Ok(uri) = format!("/v1/uploads{query}").parse() {
             let original = std::mem::replace(request.uri_mut(), uri);
             request.extensions_mut().insert(OriginalUri(original));
         }
-    } else if path.starts_with("/v1/uploads/") && *request.method() == Method::POST {
-        let name = request.headers().get("x-http-method-override");
-        let method = name.and_then(|name| Method::from_bytes(name.as_bytes()).ok());
-        *request.method_mut() = method.unwrap_or(Method::POST);
+    }
+    let name = request.headers().get("x-http-method-override");
+    if let Some(Ok(method)) = name.map(|name| Method::from_bytes(name.as_bytes())) {
+        *request.method_mut() = method;
     }
     request
 }

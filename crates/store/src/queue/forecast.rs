@@ -103,6 +103,11 @@ impl Forecast {
         (self.workers > 0).then_some(seconds)
     }
 
+    /// Seconds that a worker takes for planned CPU-seconds of a task that is no tile.
+    pub(crate) fn other_seconds(&self, cost: f64) -> f64 {
+        self.others_rate * cost
+    }
+
     /// The place of a job that waits among all that do, from 1.
     pub(crate) fn position(&self, job: JobId) -> usize {
         self.ahead(job).position

@@ -7,7 +7,7 @@ use crate::Store;
 use crate::columns::sql_as;
 use crate::error::{Result, StoreError};
 use crate::tables::labs;
-use engine::job::{Lab, TokenId};
+use engine::job::{Lab, Timestamp, TokenId};
 
 /// Checks of a lab that may wait and run at a time.
 const MOST_CHECKS: u64 = 32;
@@ -123,9 +123,15 @@ pub async fn check_jobs(connection: &mut SqliteConnection, lab: &Lab, most: u64)
 /// Refuses another upload in pieces if the lab has enough that are unfinished.
 /// Errors: [`StoreError::ManyPartials`].
 pub async fn check_partials(connection: &mut SqliteConnection, lab: &Lab) -> Result<()> {
-    let open = "SELECT count(*) FROM partials WHERE lab = ? AND result IS NULL";
-    let open: u64 = sql_as!(open, [lab]).fetch_one(connection).await?;
-    if open < MOST_PARTIALS { Ok(()) } else { Err(StoreError::ManyPartials(open)) }
+    let open = "SELECT count(*), coalesce(min(expires_at), 0) FROM partials
+                WHERE lab = ? AND result IS NULL";
+    let (uploads, expires_at): (u64, Timestamp) =
+        sql_as!(open, [lab]).fetch_one(connection).await?;
+    if uploads < MOST_PARTIALS {
+        return Ok(());
+    }
+    let seconds = (expires_at.0 - Timestamp::now().0).max(0) as f64 / 1000.0;
+    Err(StoreError::ManyPartials { uploads, seconds })
 }
 
 /// Refuses another check if enough of the lab wait and run.
@@ -137,7 +143,15 @@ pub async fn check_checks(connection: &mut SqliteConnection, lab: &Lab) -> Resul
     if checks < MOST_CHECKS {
         return Ok(());
     }
-    let mean = "SELECT seconds / tasks FROM totals WHERE kind = 'check' AND tasks > 0";
-    let mean_seconds = sql_as!(mean).fetch_optional(connection).await?;
-    Err(StoreError::ManyChecks { checks, mean_seconds })
+    // The mean time of those that have ended. Before one has, the planned time of the shortest.
+    let seconds: f64 = sql_as!(
+        "SELECT coalesce(
+             (SELECT seconds / tasks FROM totals WHERE kind = 'check' AND tasks > 0),
+             (SELECT min(cost) FROM tasks
+              WHERE lab = ? AND kind = 'check' AND state IN ('ready', 'running')))",
+        [lab]
+    )
+    .fetch_one(connection)
+    .await?;
+    Err(StoreError::ManyChecks { checks, seconds })
 }
