@@ -15,15 +15,13 @@ use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 use crate::audit::AuditLog;
-#[cfg(feature = "nats")]
-use crate::config::{ClusterArguments, RemoteArguments, VERSION};
 use crate::config::{
-    ConfigError, DeviceState, EngineArguments, ServeArguments, Takes, WorkerArguments,
+    ClusterArguments, ConfigError, DeviceState, EngineArguments, RemoteArguments, ServeArguments,
+    Takes, VERSION, WorkerArguments,
 };
 use crate::http::{App, Machine, Metrics, listen, router};
 use engine::pipeline::networks::{NetworkError, NetworkSource};
 use store::{Purpose, Store, StoreError};
-#[cfg(feature = "nats")]
 use workers::nats::{
     Access, ClusterError, Credential, Hub, HubSettings, Program, describe_metrics,
 };
@@ -50,7 +48,6 @@ pub enum ServeError {
     Io { action: &'static str, source: std::io::Error },
     #[error("can't write the audit log {file}: {source}; correct --audit-log, or its permissions")]
     Audit { file: String, source: std::io::Error },
-    #[cfg(feature = "nats")]
     #[error(transparent)]
     Cluster(#[from] ClusterError),
     #[error("can't collect metrics: {0}")]
@@ -108,14 +105,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let metrics = Metrics::install()?;
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
-    #[cfg(feature = "nats")]
     let hub = cluster(settings, &networks, &store).await?;
-    #[cfg(not(feature = "nats"))]
-    store.disown_remote().await?;
-    #[cfg(feature = "nats")]
     let trouble = hub.as_ref().map(Hub::trouble);
-    #[cfg(not(feature = "nats"))]
-    let trouble = None;
     let mut lines = vec![workers.clone(); settings.worker_count()];
     // Clients wait for the checks of their uploads, so these must not wait for tiles. Short tasks need no GPU, and checks of
     // users' networks run where these networks will.
@@ -154,7 +145,6 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         () = drain_time_over(stop) => tracing::warn!("requests were interrupted by the shutdown"),
     }
     // 6. Shut down. Workers of this machine return their tasks; workers on others continue.
-    #[cfg(feature = "nats")]
     drop(hub);
     supervisor.ended().await;
     store.advance_generation().await?;
@@ -193,7 +183,6 @@ fn allowance(planned: u64) -> u64 {
 fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
     WorkerArguments {
         data: Some(root.to_owned()),
-        #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
         takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
         memory_bytes: Some(allowance(settings.worker_memory_bytes)),
@@ -205,7 +194,6 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
 }
 
 /// Starts to hand out tiles to other machines, if a NATS server is configured.
-#[cfg(feature = "nats")]
 async fn cluster(
     settings: &ServeArguments,
     networks: &NetworkSource,

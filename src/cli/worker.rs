@@ -8,20 +8,16 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use super::confine::{confine_worker, folders_of, limit_memory};
-#[cfg(feature = "nats")]
 use super::guard::guard;
 use super::output::print_line;
 use super::supervisor::device_line;
 use super::{CliError, logging};
 use crate::cli::error::Result;
-#[cfg(feature = "nats")]
-use crate::config::VERSION;
-use crate::config::WorkerArguments;
+use crate::config::{VERSION, WorkerArguments};
 use engine::job::WorkerId;
 use engine::pipeline::networks::NetworkSource;
 use reconstruction::priors::onnx::Device;
 use store::{Purpose, Store, StoreError};
-#[cfg(feature = "nats")]
 use workers::nats::{ClusterError, Program, Remote, RemoteSettings};
 use workers::{Local, ModelCommand, Worker, WorkerError};
 
@@ -54,7 +50,6 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
         .enable_all()
         .build()
         .map_err(|error| failed(&error))?;
-    #[cfg(feature = "nats")]
     if settings.remote.nats.is_wanted() && !settings.supervised {
         return runtime.block_on(guard(&settings.remote.cache_folder(), terminated()));
     }
@@ -67,7 +62,6 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
                 tracing::info!("{error}");
                 Ok(())
             }
-            #[cfg(feature = "nats")]
             Err(WorkEnd::Cluster(error)) => Err(error.into()),
             Err(WorkEnd::Store(error)) => Err(error.into()),
             Err(WorkEnd::Worker(WorkerError::DeviceLost(reason))) => {
@@ -98,7 +92,6 @@ enum WorkEnd {
     Worker(#[from] WorkerError),
     #[error(transparent)]
     Store(#[from] StoreError),
-    #[cfg(feature = "nats")]
     #[error(transparent)]
     Cluster(#[from] ClusterError),
 }
@@ -110,7 +103,6 @@ async fn work(
 ) -> Result<(), WorkEnd> {
     let id = settings.id.unwrap_or_else(WorkerId::new);
     let stall = Duration::from_secs(settings.engine.stall_seconds);
-    #[cfg(feature = "nats")]
     if settings.remote.nats.is_wanted() {
         let remote = remote_settings(settings, &network);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
@@ -129,7 +121,6 @@ async fn work(
     Ok(ended?)
 }
 
-#[cfg(feature = "nats")]
 fn remote_settings(settings: &WorkerArguments, network: &NetworkSource) -> RemoteSettings {
     let remote = &settings.remote;
     RemoteSettings {
