@@ -39,6 +39,18 @@ impl InvalidText {
     }
 }
 
+/// Checks the name of a `kind` of thing: a plain word, so that it needs no escapes anywhere.
+pub(super) fn plain_name(text: &str, kind: &str, longest: usize) -> Result<String, InvalidText> {
+    let is_good = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
+    if (1..=longest).contains(&text.len()) && text.bytes().all(is_good) {
+        return Ok(text.to_owned());
+    }
+    let start: String = text.chars().take(60).collect();
+    Err(InvalidText(format!(
+        "{start:?} is not a valid {kind} name: use 1 to {longest} characters of a-z, 0-9 and -"
+    )))
+}
+
 /// A violation in a request, and its place.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct InvalidField {
