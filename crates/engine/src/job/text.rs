@@ -261,6 +261,18 @@ impl fmt::Display for Timestamp {
     }
 }
 
+/// The text of an error and its causes.
+pub fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    for cause in std::iter::successors(error.source(), |cause| cause.source()) {
+        let cause = cause.to_string();
+        if !text.contains(&cause) {
+            text += &format!(": {cause}");
+        }
+    }
+    text
+}
+
 /// Replaces each absolute path in a text by its last component. Error messages stay useful, and do not reveal the
 /// folders of the service.
 pub fn without_paths(text: &str) -> String {
