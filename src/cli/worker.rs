@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use tokio::io::AsyncReadExt;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use super::confine::{confine_worker, folders_of, limit_memory};
 use super::guard::guard;
 use super::output::print_line;
+use super::serve::stop_signal;
 use super::supervisor::device_line;
 use super::{CliError, logging};
 use crate::cli::error::Result;
@@ -180,17 +180,9 @@ async fn listen(supervised: bool, stop: CancellationToken) {
 }
 
 async fn terminated() {
-    let terminate = async {
-        match signal(SignalKind::terminate()) {
-            Ok(mut signal) => {
-                signal.recv().await;
-            }
-            Err(_) => std::future::pending().await,
-        }
-    };
-    tokio::select! {
-        () = terminate => {}
-        _ = tokio::signal::ctrl_c() => {}
+    match stop_signal() {
+        Ok(signal) => signal.await,
+        Err(_) => std::future::pending().await,
     }
 }
 
