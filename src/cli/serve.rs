@@ -2,9 +2,10 @@
 
 use std::io::Write;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
@@ -30,6 +31,24 @@ use workers::nats::{
 const DRAIN: Duration = Duration::from_secs(20);
 /// The file in the data folder with the address of the service.
 const ADDRESS_FILE: &str = "server.json";
+
+/// The address of a running service, and the file of its audit log.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Announcement {
+    pub(super) address: SocketAddr,
+    pub(super) url: String,
+    pid: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) audit_log: Option<PathBuf>,
+}
+
+impl Announcement {
+    /// Reads the announcement in a data folder.
+    /// Errors: none can be read, as while no service runs.
+    pub(super) fn read(data: &Path) -> std::io::Result<Self> {
+        Ok(serde_json::from_slice(&std::fs::read(data.join(ADDRESS_FILE))?)?)
+    }
+}
 
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
@@ -158,16 +177,15 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
 /// Announces the address of the service, and the file of its audit log, as one JSON line on standard output and in a
 /// file.
 fn announce(root: &Path, address: SocketAddr, settings: &ServeArguments) -> Result<(), ServeError> {
-    let mut facts = serde_json::json!({
-        "address": address.to_string(),
-        "url": format!("http://{address}"),
-        "pid": std::process::id(),
-    });
-    if let Some(file) = &settings.audit.audit_log {
-        let file = std::path::absolute(file).map_err(io("find the audit log"))?;
-        facts["audit_log"] = file.to_string_lossy().into();
-    }
-    let text = facts.to_string();
+    let audit_log = settings.audit.audit_log.as_ref().map(std::path::absolute).transpose();
+    let audit_log = audit_log.map_err(io("find the audit log"))?;
+    let announcement = Announcement {
+        address,
+        url: format!("http://{address}"),
+        pid: std::process::id(),
+        audit_log: audit_log.map(|file| file.to_string_lossy().into_owned().into()),
+    };
+    let text = serde_json::json!(announcement).to_string();
     let (path, draft) = (root.join(ADDRESS_FILE), root.join("server.json.new"));
     std::fs::write(&draft, &text).map_err(io("write server.json"))?;
     std::fs::rename(draft, path).map_err(io("write server.json"))?;
