@@ -11,7 +11,6 @@ use hyper::http::{HeaderValue, Uri};
 use ipnet::IpNet;
 use strum::IntoStaticStr;
 
-#[cfg(feature = "nats")]
 use engine::job::{Pool, Webhook, WorkerId};
 use engine::pipeline::networks::{NetworkError, NetworkSource, find_library};
 use reconstruction::priors::onnx::Device;
@@ -81,7 +80,6 @@ pub struct ServeArguments {
     pub workers: Option<usize>,
 
     /// Workers on other machines.
-    #[cfg(feature = "nats")]
     #[command(flatten)]
     pub cluster: ClusterArguments,
 
@@ -229,7 +227,6 @@ pub struct AuditArguments {
 }
 
 /// Address of a NATS server, and a credential for it.
-#[cfg(feature = "nats")]
 #[derive(Debug, Clone, Default, Args)]
 pub struct NatsArguments {
     /// Addresses of a NATS server with JetStream, such as nats://host:4222 or tls://host:4222, separated by
@@ -242,7 +239,6 @@ pub struct NatsArguments {
     pub nats_creds: Option<PathBuf>,
 }
 
-#[cfg(feature = "nats")]
 impl NatsArguments {
     /// True if a NATS server is configured.
     #[must_use]
@@ -252,7 +248,6 @@ impl NatsArguments {
 }
 
 /// Settings for workers on other machines.
-#[cfg(feature = "nats")]
 #[derive(Debug, Clone, Args)]
 pub struct ClusterArguments {
     /// The NATS server.
@@ -271,7 +266,6 @@ pub struct ClusterArguments {
 }
 
 /// Settings of a worker for a server elsewhere.
-#[cfg(feature = "nats")]
 #[derive(Debug, Clone, Default, Args)]
 pub struct RemoteArguments {
     /// The NATS server.
@@ -304,7 +298,6 @@ pub struct RemoteArguments {
     pub died: Option<String>,
 }
 
-#[cfg(feature = "nats")]
 impl RemoteArguments {
     /// The folder of the cache.
     #[must_use]
@@ -320,13 +313,10 @@ impl RemoteArguments {
 #[derive(Debug, Clone, Args)]
 pub struct WorkerArguments {
     /// Folder with the database, uploads and results; ignored for a server on another machine.
-    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
-    #[cfg_attr(feature = "nats", arg(required_unless_present_any = ["nats", "nats_creds"]))]
-    #[cfg_attr(not(feature = "nats"), arg(required = true))]
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR", required_unless_present_any = ["nats", "nats_creds"])]
     pub data: Option<PathBuf>,
 
     /// Settings for a server elsewhere.
-    #[cfg(feature = "nats")]
     #[command(flatten)]
     pub remote: RemoteArguments,
 
@@ -436,7 +426,6 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 /// A share from 0 to 1.
-#[cfg(feature = "nats")]
 fn fraction(text: &str) -> Result<f64, String> {
     let share = text.parse().ok().filter(|share| (0.0..=1.0).contains(share));
     share.ok_or_else(|| format!("{text:?} is not a share from 0 to 1"))
@@ -522,11 +511,7 @@ impl ServeArguments {
     /// True if the workers of this machine leave the tiles to others.
     #[must_use]
     pub fn without_tiles(&self) -> bool {
-        #[cfg(feature = "nats")]
-        let is_cluster = self.cluster.nats.is_wanted();
-        #[cfg(not(feature = "nats"))]
-        let is_cluster = false;
-        is_cluster && self.workers == Some(0)
+        self.cluster.nats.is_wanted() && self.workers == Some(0)
     }
 
     #[must_use]
@@ -586,7 +571,6 @@ impl WorkerArguments {
     /// containers and configuration files set for all commands.
     #[must_use]
     pub fn data_folder(&self) -> Option<&Path> {
-        #[cfg(feature = "nats")]
         if self.remote.nats.is_wanted() {
             return None;
         }
@@ -695,7 +679,6 @@ mod tests {
     }
 
     #[test]
-    #[cfg(feature = "nats")]
     fn a_worker_of_a_server_elsewhere_has_no_data_folder() {
         let folder = |more: &[&str]| {
             let line = [&["--data", "d"], more].concat();

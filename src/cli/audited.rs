@@ -1,10 +1,9 @@
 //! Records the changes that commands make on the machine of the service.
 
-use std::path::{Path, PathBuf};
-
-use serde::Deserialize;
+use std::path::Path;
 
 use super::CliError;
+use super::serve::Announcement;
 use crate::audit::{Actor, AuditLog, Entry, Outcome};
 use crate::cli::error::Result;
 use crate::config::AuditArguments;
@@ -22,19 +21,10 @@ pub(super) struct Change {
     pub object: String,
 }
 
-/// The part of `server.json` that is read here.
-#[derive(Deserialize)]
-struct Announcement {
-    audit_log: Option<PathBuf>,
-}
-
 /// The audit log with the given file, or else with that of the service that runs on the data folder.
 /// Errors: the file can't be written.
 pub(super) fn audit_log(arguments: &AuditArguments, data: &Path) -> Result<AuditLog> {
-    let announced = || {
-        let text = std::fs::read(data.join("server.json")).ok()?;
-        serde_json::from_slice::<Announcement>(&text).ok()?.audit_log
-    };
+    let announced = || Announcement::read(data).ok()?.audit_log;
     let Some(file) = arguments.audit_log.clone().or_else(announced) else {
         return Ok(AuditLog::default());
     };

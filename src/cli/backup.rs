@@ -6,9 +6,9 @@ use clap::Args;
 
 use super::CliError;
 use super::output::print_line;
-use super::wait::wait;
+use super::wait::with_store;
 use crate::cli::error::Result;
-use store::{Backup, Purpose, Store};
+use store::{Backup, Store};
 
 /// Copy the data folder while the service runs.
 ///
@@ -30,16 +30,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let text = format!("{} already exists; choose a new folder", arguments.out.display());
         return Err(CliError::Input(text));
     }
-    let backup = wait(async {
-        let store = Store::open(&arguments.data, Purpose::Use).await?;
-        let backup = store.backup(&arguments.out).await?;
-        store.close().await;
-        Ok::<_, CliError>(backup)
-    })?;
-    let Backup { files, bytes, damaged, missing } = backup;
-    print_line(
-        serde_json::json!({"files": files, "bytes": bytes, "damaged": damaged, "missing": missing}),
-    )?;
+    let act = async |store: &Store| Ok(store.backup(&arguments.out).await?);
+    let backup = with_store(&arguments.data, act)?;
+    print_line(serde_json::json!(backup))?;
+    let Backup { damaged, missing, .. } = backup;
     if damaged.is_empty() && missing.is_empty() {
         return Ok(());
     }

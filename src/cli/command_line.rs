@@ -52,7 +52,6 @@ enum Command {
     Job(super::job::Arguments),
     Backup(super::backup::Arguments),
     Verify(super::verify::Arguments),
-    #[cfg(feature = "nats")]
     Cluster(super::cluster::Arguments),
     /// Show settings and their origins.
     Config {
@@ -92,18 +91,7 @@ const GROUPS: [(&str, &[&str]); 4] = [
     ("Server", &["serve", "worker", "devices", "health"]),
     (
         "Administration",
-        &[
-            "token",
-            "lab",
-            "job",
-            "backup",
-            "verify",
-            #[cfg(feature = "nats")]
-            "cluster",
-            "config",
-            "completions",
-            "man",
-        ],
+        &["token", "lab", "job", "backup", "verify", "cluster", "config", "completions", "man"],
     ),
     (
         "Offline",
@@ -168,7 +156,6 @@ fn perform(arguments: Arguments) -> Result<()> {
         Command::Job(arguments) => super::job::run(&arguments),
         Command::Backup(arguments) => super::backup::run(&arguments),
         Command::Verify(arguments) => super::verify::run(&arguments),
-        #[cfg(feature = "nats")]
         Command::Cluster(arguments) => super::cluster::run(&arguments),
         Command::Config { action: ConfigAction::Show { names, rest } } => {
             print_line(super::settings::show(&command(), &names, &rest, arguments.config)?)

@@ -10,7 +10,7 @@ use super::client::Job;
 use super::error::Result;
 
 /// The option of `watch` and `watch-folder`.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub struct ExecArguments {
     /// Shell command that runs each time a job has ended. JOB_ID, JOB_STATE, JOB_LABEL, JOB_ERROR and JOB_VERDICT describe
     /// the job; watch-folder also sets JOB_FILE and JOB_RESULTS, and runs it for refused files, too [default: none].

@@ -1,15 +1,14 @@
 //! `sci-recon health`: asks whether the service of a data folder is ready, for the health check of a container.
 
-use std::fs;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use serde::Deserialize;
 
 use super::CliError;
 use super::output::print_line;
+use super::serve::Announcement;
 use super::wait::wait;
 use crate::cli::error::Result;
 
@@ -26,21 +25,11 @@ pub struct Arguments {
     data: PathBuf,
 }
 
-#[derive(Debug, Deserialize)]
-struct Announcement {
-    address: SocketAddr,
-}
-
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let path = arguments.data.join("server.json");
-    let failed = |error: &dyn std::fmt::Display| {
-        CliError::Failure(format!(
-            "no service runs on this data folder ({}): {error}",
-            path.display()
-        ))
-    };
-    let text = fs::read_to_string(&path).map_err(|error| failed(&error))?;
-    let announced: Announcement = serde_json::from_str(&text).map_err(|error| failed(&error))?;
+    let announced = Announcement::read(&arguments.data).map_err(|error| {
+        let data = arguments.data.display();
+        CliError::Failure(format!("no service runs on this data folder ({data}): {error}"))
+    })?;
     print_line(wait(ask(announced.address))?)
 }
 

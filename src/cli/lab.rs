@@ -6,7 +6,8 @@ use clap::{Args, Subcommand};
 
 use super::CliError;
 use super::audited::{Change, audit_log, audited};
-use super::wait::print_of_store;
+use super::output::print_line;
+use super::wait::with_store;
 use crate::audit::AuditLog;
 use crate::cli::error::Result;
 use crate::config::AuditArguments;
@@ -96,7 +97,8 @@ fn share(text: &str) -> Result<f64, String> {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     let log = audit_log(&arguments.audit, &arguments.data)?;
-    print_of_store(&arguments.data, async |store| act(store, &log, &arguments.action).await)
+    let act = async |store: &Store| act(store, &log, &arguments.action).await;
+    print_line(with_store(&arguments.data, act)?)
 }
 
 async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use ndarray::{Array2, Array3, Axis};
 use serde::Serialize;
+use strum::IntoStaticStr;
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
@@ -44,7 +45,8 @@ pub struct MaskArguments {
 }
 
 /// Kinds of masks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 enum Pattern {
     /// Independent binary pixels, half of them open, as in the public benchmark.
     Iid,
@@ -90,13 +92,7 @@ pub struct SimulatedMasks {
 
 impl MaskArguments {
     pub fn pattern(&self) -> &'static str {
-        match self.pattern {
-            Pattern::Iid => "iid",
-            Pattern::RandomSquares => "random-squares",
-            Pattern::RotatingCircle => "rotating-circle",
-            Pattern::SingleApertures => "single-apertures",
-            Pattern::Images => "images",
-        }
+        self.pattern.into()
     }
 
     /// The pattern, the blur and the leak as text, such as `iid, blur 0.7, leak 0.1`.

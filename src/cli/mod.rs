@@ -10,7 +10,6 @@ mod command_line;
 mod confine;
 mod error;
 mod exec;
-#[cfg(feature = "nats")]
 mod guard;
 mod logging;
 mod maintenance;
@@ -30,7 +29,6 @@ pub mod backup;
 pub mod calibrate;
 pub mod cancel;
 pub mod check_model;
-#[cfg(feature = "nats")]
 pub mod cluster;
 pub mod demo;
 pub mod devices;

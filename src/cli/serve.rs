@@ -2,9 +2,10 @@
 
 use std::io::Write;
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
@@ -15,15 +16,13 @@ use super::logging;
 use super::maintenance::maintain;
 use super::supervisor::Supervisor;
 use crate::audit::AuditLog;
-#[cfg(feature = "nats")]
-use crate::config::{ClusterArguments, RemoteArguments, VERSION};
 use crate::config::{
-    ConfigError, DeviceState, EngineArguments, ServeArguments, Takes, WorkerArguments,
+    ClusterArguments, ConfigError, DeviceState, EngineArguments, RemoteArguments, ServeArguments,
+    Takes, VERSION, WorkerArguments,
 };
 use crate::http::{App, Machine, Metrics, listen, router};
 use engine::pipeline::networks::{NetworkError, NetworkSource};
 use store::{Purpose, Store, StoreError};
-#[cfg(feature = "nats")]
 use workers::nats::{
     Access, ClusterError, Credential, Hub, HubSettings, Program, describe_metrics,
 };
@@ -32,6 +31,24 @@ use workers::nats::{
 const DRAIN: Duration = Duration::from_secs(20);
 /// The file in the data folder with the address of the service.
 const ADDRESS_FILE: &str = "server.json";
+
+/// The address of a running service, and the file of its audit log.
+#[derive(Debug, Serialize, Deserialize)]
+pub(super) struct Announcement {
+    pub(super) address: SocketAddr,
+    pub(super) url: String,
+    pid: u32,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) audit_log: Option<PathBuf>,
+}
+
+impl Announcement {
+    /// Reads the announcement in a data folder.
+    /// Errors: none can be read, as while no service runs.
+    pub(super) fn read(data: &Path) -> std::io::Result<Self> {
+        Ok(serde_json::from_slice(&std::fs::read(data.join(ADDRESS_FILE))?)?)
+    }
+}
 
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
@@ -50,7 +67,6 @@ pub enum ServeError {
     Io { action: &'static str, source: std::io::Error },
     #[error("can't write the audit log {file}: {source}; correct --audit-log, or its permissions")]
     Audit { file: String, source: std::io::Error },
-    #[cfg(feature = "nats")]
     #[error(transparent)]
     Cluster(#[from] ClusterError),
     #[error("can't collect metrics: {0}")]
@@ -112,14 +128,8 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let metrics = Metrics::install()?;
     let program = std::env::current_exe().map_err(io("find this program"))?;
     let workers = worker_arguments(settings, store.dir().root());
-    #[cfg(feature = "nats")]
     let hub = cluster(settings, &networks, &store).await?;
-    #[cfg(not(feature = "nats"))]
-    store.disown_remote().await?;
-    #[cfg(feature = "nats")]
     let trouble = hub.as_ref().map(Hub::trouble);
-    #[cfg(not(feature = "nats"))]
-    let trouble = None;
     let mut lines = vec![workers.clone(); settings.worker_count()];
     // Clients wait for the checks of their uploads, so these must not wait for tiles. Short tasks need no GPU, and checks of
     // users' networks run where these networks will.
@@ -158,7 +168,6 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
         () = drain_time_over(stop) => tracing::warn!("requests were interrupted by the shutdown"),
     }
     // 6. Shut down. Workers of this machine return their tasks; workers on others continue.
-    #[cfg(feature = "nats")]
     drop(hub);
     supervisor.ended().await;
     store.advance_generation().await?;
@@ -172,16 +181,15 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
 /// Announces the address of the service, and the file of its audit log, as one JSON line on standard output and in a
 /// file.
 fn announce(root: &Path, address: SocketAddr, settings: &ServeArguments) -> Result<(), ServeError> {
-    let mut facts = serde_json::json!({
-        "address": address.to_string(),
-        "url": format!("http://{address}"),
-        "pid": std::process::id(),
-    });
-    if let Some(file) = &settings.audit.audit_log {
-        let file = std::path::absolute(file).map_err(io("find the audit log"))?;
-        facts["audit_log"] = file.to_string_lossy().into();
-    }
-    let text = facts.to_string();
+    let audit_log = settings.audit.audit_log.as_ref().map(std::path::absolute).transpose();
+    let audit_log = audit_log.map_err(io("find the audit log"))?;
+    let announcement = Announcement {
+        address,
+        url: format!("http://{address}"),
+        pid: std::process::id(),
+        audit_log: audit_log.map(|file| file.to_string_lossy().into_owned().into()),
+    };
+    let text = serde_json::json!(announcement).to_string();
     let (path, draft) = (root.join(ADDRESS_FILE), root.join("server.json.new"));
     std::fs::write(&draft, &text).map_err(io("write server.json"))?;
     std::fs::rename(draft, path).map_err(io("write server.json"))?;
@@ -197,7 +205,6 @@ fn allowance(planned: u64) -> u64 {
 fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
     WorkerArguments {
         data: Some(root.to_owned()),
-        #[cfg(feature = "nats")]
         remote: RemoteArguments::default(),
         takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
         memory_bytes: Some(allowance(settings.worker_memory_bytes)),
@@ -209,7 +216,6 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
 }
 
 /// Starts to hand out tiles to other machines, if a NATS server is configured.
-#[cfg(feature = "nats")]
 async fn cluster(
     settings: &ServeArguments,
     networks: &NetworkSource,
@@ -233,7 +239,7 @@ async fn cluster(
 }
 
 /// Starts to listen for SIGTERM and Ctrl-C. The future completes at the first one.
-fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
+pub(super) fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     Ok(async move {
@@ -244,7 +250,7 @@ fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
     })
 }
 
-async fn stopped(mut stop: watch::Receiver<bool>) {
+pub(super) async fn stopped(mut stop: watch::Receiver<bool>) {
     // An error means that the sender was dropped, which is a stop as well.
     let _ = stop.wait_for(|stop| *stop).await;
 }

@@ -134,10 +134,6 @@ pub fn show(
 
 /// Refuses values of a line and of its configuration file as the command itself would. Required options may be missing.
 fn check_values(root: &Command, line: &[OsString], path: Option<&PathBuf>) -> Result<()> {
-    use ErrorKind::{
-        ArgumentConflict, InvalidUtf8, InvalidValue, TooManyValues, ValueValidation,
-        WrongNumberOfValues,
-    };
     let config = path.map(|path| [OsString::from(format!("--{CONFIG}")), path.into()]);
     let (program, rest) = line.split_at(line.len().min(1));
     let line =
@@ -145,12 +141,12 @@ fn check_values(root: &Command, line: &[OsString], path: Option<&PathBuf>) -> Re
     let expanded = expand(root, line.collect())?;
     let Err(error) = root.clone().try_get_matches_from(&expanded.line) else { return Ok(()) };
     let refused = [
-        ArgumentConflict,
-        InvalidUtf8,
-        InvalidValue,
-        TooManyValues,
-        ValueValidation,
-        WrongNumberOfValues,
+        ErrorKind::ArgumentConflict,
+        ErrorKind::InvalidUtf8,
+        ErrorKind::InvalidValue,
+        ErrorKind::TooManyValues,
+        ErrorKind::ValueValidation,
+        ErrorKind::WrongNumberOfValues,
     ];
     if !refused.contains(&error.kind()) {
         return Ok(());

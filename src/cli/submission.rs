@@ -7,14 +7,14 @@ use serde_json::{Map, Value, json};
 
 use super::CliError;
 use super::arguments::{
-    DispersionArguments, MaskFileArguments, SnapshotFileArguments, Snapshots, named, named_all,
-    registration,
+    AlgorithmArguments, DispersionArguments, MaskFileArguments, SnapshotFileArguments, Snapshots,
+    named, registration,
 };
 use super::client::{Client, Result};
 use super::fields::Role;
 use engine::job::{
-    Algorithm, CalibrationId, CalibrationRequest, Dispersion, JobId, Label, Mosaic,
-    RegistrationRequest, Sequence, Sha256, fields,
+    CalibrationId, CalibrationRequest, Dispersion, JobId, Label, Mosaic, RegistrationRequest,
+    Sequence, Sha256, fields,
 };
 
 /// Options of the calibration, the measurement and the job.
@@ -23,15 +23,14 @@ use engine::job::{
 pub(super) struct SubmissionArguments {
     /// The calibration that the snapshots were taken with.
     #[arg(long, value_name = "ID", help_heading = CALIBRATION,
-          conflicts_with_all = ["masks_array", "masks_axes", "masks_crop", "masks_frames", "masks_packing", "bad_pixels"])]
+          conflicts_with = "MaskFileArguments")]
     calibration: Option<CalibrationId>,
     /// Masks [frame, row, column] instead of a calibration. The same file creates one calibration only.
     #[arg(long, value_name = "FILE", conflicts_with = "calibration", help_heading = CALIBRATION)]
     masks: Option<PathBuf>,
     /// A job that has moved its masks: they become a calibration. The same job creates one calibration only.
     #[arg(long, value_name = "JOB", help_heading = CALIBRATION,
-          conflicts_with_all = ["calibration", "masks", "masks_array", "masks_axes", "masks_crop", "masks_frames",
-                                "masks_packing", "masks_full_scale", "mosaic", "bad_pixels"])]
+          conflicts_with_all = ["calibration", "masks", "MaskFileArguments", "masks_full_scale", "mosaic"])]
     registration_of: Option<JobId>,
     #[command(flatten, next_help_heading = CALIBRATION)]
     mask_file: MaskFileArguments,
@@ -65,16 +64,11 @@ pub(super) struct SubmissionArguments {
     /// Name of the measurement [default: none].
     #[arg(long, value_name = "TEXT", help_heading = MEASUREMENT)]
     name: Option<String>,
-    /// The algorithm.
-    #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
-          value_parser = named_all(), help_heading = JOB)]
-    algorithm: Algorithm,
+    #[command(flatten, next_help_heading = JOB)]
+    algorithm: AlgorithmArguments,
     /// The network of `learned`.
     #[arg(long, value_name = "ID", help_heading = JOB)]
     model: Option<String>,
-    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's default.
-    #[arg(long, value_name = "FILE", help_heading = JOB)]
-    schedule: Option<PathBuf>,
     /// The snapshots: all, an index from 0, or FIRST-LAST including both ends.
     #[arg(long, value_name = "WHICH", default_value = "all", help_heading = JOB)]
     snapshots: Snapshots,
@@ -118,38 +112,25 @@ impl PlainArguments {
     }
 }
 
-/// Options of [`SubmissionArguments`] that a manifest states. [`PlainArguments`] has the others.
-pub(super) const SETTINGS: [&str; 35] = [
+/// Options of [`SubmissionArguments`] that a manifest states, or the groups of such options. [`PlainArguments`] has the
+/// others.
+pub(super) const SETTINGS: [&str; 21] = [
     "calibration",
     "masks",
     "registration_of",
-    "masks_array",
-    "masks_axes",
-    "masks_crop",
-    "masks_frames",
-    "masks_packing",
+    "MaskFileArguments",
     "masks_full_scale",
     "masks_name",
-    "bad_pixels",
     "mosaic",
-    "dispersion_offsets",
-    "dispersion_axis",
-    "dispersion_wavelengths",
-    "dispersion_mask",
-    "array",
-    "axes",
-    "crop",
-    "packing",
-    "dark",
-    "saturation",
+    "DispersionArguments",
+    "SnapshotFileArguments",
     "full_scale",
     "camera_fps",
     "exposure_s",
     "sequence",
     "name",
-    "algorithm",
+    "AlgorithmArguments",
     "model",
-    "schedule",
     "snapshots",
     "tile",
     "overlap",
@@ -185,7 +166,7 @@ impl SubmissionArguments {
 
     /// Uploads masks, dark captures and true frames, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
-        let schedule = self.schedule()?;
+        let schedule = self.algorithm.schedule()?;
         let dispersion = self.dispersion.resolve()?;
         let calibration = match (&self.calibration, &self.masks, &self.registration_of) {
             (Some(_), ..) | (_, None, Some(_)) if dispersion.is_some() => {
@@ -267,12 +248,12 @@ impl SubmissionArguments {
     }
 
     /// A request for a job, without its measurement.
-    fn job_request(&self, schedule: Value, truth: Option<Sha256>) -> Map<String, Value> {
+    fn job_request(&self, schedule: Option<Value>, truth: Option<Sha256>) -> Map<String, Value> {
         let tile = self.tile.zip(self.overlap);
         let tile = tile.map(|(size, overlap)| json!({"size": size, "overlap": overlap}));
-        let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.into_str()))]);
+        let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.algorithm))]);
         add(&mut body, "model", json!(self.model));
-        add(&mut body, "schedule", schedule);
+        add(&mut body, "schedule", json!(schedule));
         add(&mut body, "snapshots", self.snapshots.request());
         add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
         add(&mut body, "tile", json!(tile));
@@ -280,15 +261,6 @@ impl SubmissionArguments {
         add(&mut body, "truth", json!(truth));
         self.plain.add_to(&mut body);
         body
-    }
-
-    fn schedule(&self) -> Result<Value, CliError> {
-        let Some(path) = &self.schedule else { return Ok(Value::Null) };
-        let refused = |error: &dyn std::fmt::Display| {
-            CliError::Input(format!("schedule {}: {error}", path.display()))
-        };
-        let text = std::fs::read_to_string(path).map_err(|error| refused(&error))?;
-        serde_json::from_str(&text).map_err(|error| refused(&error))
     }
 }
 
@@ -332,10 +304,12 @@ mod tests {
     use std::collections::BTreeSet;
     use std::fs;
 
+    use clap::error::ErrorKind;
     use clap::{Args, Command, FromArgMatches};
     use serde_json::{Map, Value};
 
     use super::SubmissionArguments;
+    use crate::cli::submit;
     use engine::job::Sha256;
 
     fn command() -> Command {
@@ -409,10 +383,15 @@ mod tests {
         let options: BTreeSet<&str> =
             command.get_arguments().filter_map(|arg| arg.get_long()).collect();
         assert_eq!(options, known, "an option is missing in this test");
-        let mut stated: BTreeSet<String> =
-            super::SETTINGS.iter().map(|name| name.replace('_', "-")).collect();
-        stated.extend(["priority", "label", "webhook"].map(str::to_owned));
-        assert!(stated.iter().eq(&known), "a manifest states the settings: {stated:?}");
+        for (name, value) in values {
+            let line = ["test", "--manifest=m.json", &format!("--{name}={value}")];
+            let parsed = submit::Arguments::augment_args(Command::new("test"))
+                .try_get_matches_from(line)
+                .map_err(|error| error.kind());
+            let is_free = ["priority", "label", "webhook"].contains(&name);
+            let refused = parsed.is_err_and(|kind| kind == ErrorKind::ArgumentConflict);
+            assert!(refused != is_free, "a manifest states {name}");
+        }
         let line = values.iter().map(|(name, value)| format!("--{name}={value}"));
         let line = ["test".to_owned()].into_iter().chain(line);
         let matches = command.try_get_matches_from(line).unwrap();
@@ -426,7 +405,7 @@ mod tests {
         assert_eq!(names(&calibration), expected);
         let measurement = arguments.measurement_request("id", &[sha256]);
         assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
-        let job = arguments.job_request(arguments.schedule().unwrap(), Some(sha256));
+        let job = arguments.job_request(arguments.algorithm.schedule().unwrap(), Some(sha256));
         // The measurement names the calibration.
         assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
         assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));

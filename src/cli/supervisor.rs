@@ -14,6 +14,7 @@ use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
+use super::serve::stopped;
 use crate::config::{DEVICE_LOST, DeviceState, Takes, WorkerArguments};
 use engine::job::WorkerId;
 use engine::pipeline::usage::{kills_for_memory, peak_rss_of};
@@ -92,7 +93,7 @@ impl Slot {
             pause = if start.elapsed() > HEALTHY { PAUSES.0 } else { (pause * 2).min(PAUSES.1) };
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}
-                () = stopped(&mut self.stop) => {}
+                () = stopped(self.stop.clone()) => {}
             }
         }
     }
@@ -125,7 +126,7 @@ impl Slot {
         let mut memory = Memory::of(child.id());
         let ended = tokio::select! {
             status = child.wait() => Some(status),
-            () = stopped(&mut self.stop) => None,
+            () = stopped(self.stop.clone()) => None,
             () = silent(&store, id) => {
                 tracing::warn!(worker = %id, "a worker gives no sign of life and is killed");
                 Some(child.kill().await.and(child.wait().await))
@@ -233,11 +234,6 @@ impl Memory {
             end => end,
         }
     }
-}
-
-async fn stopped(stop: &mut watch::Receiver<bool>) {
-    // An error means that the sender was dropped, which is a stop as well.
-    let _ = stop.wait_for(|stop| *stop).await;
 }
 
 /// Waits until a worker has given no sign of life for [`MAX_SILENCE`], by the monotonic clock.

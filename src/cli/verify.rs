@@ -6,9 +6,8 @@ use clap::Args;
 
 use super::CliError;
 use super::output::print_line;
-use super::wait::wait;
+use super::wait::with_store;
 use crate::cli::error::Result;
-use store::{Audit, Purpose, Store};
 
 /// Compare all stored files with their records.
 ///
@@ -23,18 +22,7 @@ pub struct Arguments {
 
 /// Verifies the folder, and prints the result as one JSON line.
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let audit = wait(async {
-        let store = Store::open(&arguments.data, Purpose::Use).await?;
-        let audit = store.verify().await?;
-        store.close().await;
-        Ok::<_, CliError>(audit)
-    })?;
-    let is_good = audit.is_good();
-    let Audit { files, bytes, database, damaged, missing, unknown } = audit;
-    let result = serde_json::json!({
-        "files": files, "bytes": bytes, "database": database, "damaged": damaged,
-        "missing": missing, "unknown": unknown,
-    });
-    print_line(result)?;
-    if is_good { Ok(()) } else { Err(CliError::Failure("the data are damaged".into())) }
+    let audit = with_store(&arguments.data, async |store| Ok(store.verify().await?))?;
+    print_line(serde_json::json!(audit))?;
+    if audit.is_good() { Ok(()) } else { Err(CliError::Failure("the data are damaged".into())) }
 }

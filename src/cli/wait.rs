@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use super::CliError;
-use super::output::print_line;
 use store::{Purpose, Store};
 
 /// Runs `work` to its end on this thread.
@@ -13,16 +12,15 @@ pub fn wait<T, E: Into<CliError>>(work: impl Future<Output = Result<T, E>>) -> R
     runtime.block_on(work).map_err(Into::into)
 }
 
-/// Opens the store in `data`, and prints the text that `act` returns.
-pub fn print_of_store(
+/// Opens the store in `data` for `act`, and closes it.
+pub fn with_store<T>(
     data: &Path,
-    act: impl AsyncFnOnce(&Store) -> Result<String, CliError>,
-) -> Result<(), CliError> {
+    act: impl AsyncFnOnce(&Store) -> Result<T, CliError>,
+) -> Result<T, CliError> {
     wait(async {
         let store = Store::open(data, Purpose::Use).await?;
         let acted = act(&store).await;
         store.close().await;
-        let text = acted?;
-        print_line(text)
+        acted
     })
 }

@@ -43,33 +43,42 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
         let client = Client::new(&arguments.service)?;
         let manifest = arguments.compared.read()?;
-        let screen = MultiProgress::with_draw_target(progress::target());
-        let wait = if screen.is_hidden() { WAIT } else { WAIT_WITH_BAR };
-        let bars: Vec<_> = arguments
-            .jobs
-            .iter()
-            .map(|id| (id.to_string(), screen.add(progress::bar(id.to_string()))))
-            .collect();
-        // Waits for all jobs concurrently.
-        let ends = bars.iter().map(|(id, bar)| async {
-            loop {
-                let requested = std::time::Instant::now();
-                let job = client.job(id, wait).await?;
-                progress::show(bar, job.progress.percent / 100.0);
-                if job.state.is_final() {
-                    arguments.exec.run(&End::of(&job), None).await?;
-                    return Ok::<Job, CliError>(job);
-                }
-                // The service answers at once if too many requests of the lab wait.
-                let pause = std::time::Duration::from_secs(1).saturating_sub(requested.elapsed());
-                tokio::time::sleep(pause).await;
-            }
-        });
-        let jobs = futures_util::future::try_join_all(ends).await;
-        // The result does not depend on the bars. A failure to clear them is ignored.
-        let _ = screen.clear();
-        report(&client, &jobs?, manifest.as_ref(), arguments.json).await
+        let jobs: Vec<_> = arguments.jobs.iter().map(ToString::to_string).collect();
+        let jobs: Vec<_> = jobs.iter().map(|id| (&**id, &**id)).collect();
+        let jobs = until_ended(&client, &jobs, &arguments.exec).await?;
+        report(&client, &jobs, manifest.as_ref(), arguments.json).await
     })
+}
+
+/// Waits for the end of all jobs, each with its name and its identifier, and shows their progress.
+/// Errors: those of the service; the command of `exec` fails.
+pub(super) async fn until_ended(
+    client: &Client,
+    jobs: &[(&str, &str)],
+    exec: &ExecArguments,
+) -> Result<Vec<Job>> {
+    let screen = MultiProgress::with_draw_target(progress::target());
+    let wait = if screen.is_hidden() { WAIT } else { WAIT_WITH_BAR };
+    let bars = jobs.iter().map(|&(name, id)| (id, screen.add(progress::bar(name.to_owned()))));
+    // Waits for all jobs concurrently.
+    let ends = bars.map(|(id, bar)| async move {
+        loop {
+            let requested = std::time::Instant::now();
+            let job = client.job(id, wait).await?;
+            progress::show(&bar, job.progress.percent / 100.0);
+            if job.state.is_final() {
+                exec.run(&End::of(&job), None).await?;
+                return Ok::<Job, CliError>(job);
+            }
+            // The service answers at once if too many requests of the lab wait.
+            let pause = std::time::Duration::from_secs(1).saturating_sub(requested.elapsed());
+            tokio::time::sleep(pause).await;
+        }
+    });
+    let jobs = futures_util::future::try_join_all(ends).await;
+    // The result does not depend on the bars. A failure to clear them is ignored.
+    let _ = screen.clear();
+    jobs
 }
 
 async fn report(

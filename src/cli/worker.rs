@@ -5,24 +5,20 @@ use std::time::Duration;
 
 use futures_util::future::try_join_all;
 use tokio::io::AsyncReadExt;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use super::confine::{confine_worker, folders_of, limit_memory};
-#[cfg(feature = "nats")]
 use super::guard::guard;
 use super::output::print_line;
+use super::serve::stop_signal;
 use super::supervisor::device_line;
 use super::{CliError, logging};
 use crate::cli::error::Result;
-#[cfg(feature = "nats")]
-use crate::config::VERSION;
-use crate::config::WorkerArguments;
+use crate::config::{VERSION, WorkerArguments};
 use engine::job::WorkerId;
 use engine::pipeline::networks::NetworkSource;
 use reconstruction::priors::onnx::Device;
 use store::{Claimant, Purpose, Store, StoreError};
-#[cfg(feature = "nats")]
 use workers::nats::{ClusterError, Program, Remote, RemoteSettings};
 use workers::{Local, ModelCommand, Worker, WorkerError};
 
@@ -55,7 +51,6 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
         .enable_all()
         .build()
         .map_err(|error| failed(&error))?;
-    #[cfg(feature = "nats")]
     if settings.remote.nats.is_wanted() && !settings.supervised {
         return runtime.block_on(guard(&settings.remote.cache_folder(), terminated()));
     }
@@ -68,7 +63,6 @@ pub fn run(settings: &WorkerArguments) -> Result<()> {
                 tracing::info!("{error}");
                 Ok(())
             }
-            #[cfg(feature = "nats")]
             Err(WorkEnd::Cluster(error)) => Err(error.into()),
             Err(WorkEnd::Store(error)) => Err(error.into()),
             Err(WorkEnd::Worker(WorkerError::DeviceLost(reason))) => {
@@ -99,7 +93,6 @@ enum WorkEnd {
     Worker(#[from] WorkerError),
     #[error(transparent)]
     Store(#[from] StoreError),
-    #[cfg(feature = "nats")]
     #[error(transparent)]
     Cluster(#[from] ClusterError),
 }
@@ -111,7 +104,6 @@ async fn work(
 ) -> Result<(), WorkEnd> {
     let id = settings.id.unwrap_or_else(WorkerId::new);
     let stall = Duration::from_secs(settings.engine.stall_seconds);
-    #[cfg(feature = "nats")]
     if settings.remote.nats.is_wanted() {
         let remote = remote_settings(settings, &network);
         let Some(remote) = Remote::open(remote, id, stop.clone()).await? else { return Ok(()) };
@@ -133,7 +125,6 @@ async fn work(
     Ok(())
 }
 
-#[cfg(feature = "nats")]
 fn remote_settings(settings: &WorkerArguments, network: &NetworkSource) -> RemoteSettings {
     let remote = &settings.remote;
     RemoteSettings {
@@ -193,17 +184,9 @@ async fn listen(supervised: bool, stop: CancellationToken) {
 }
 
 async fn terminated() {
-    let terminate = async {
-        match signal(SignalKind::terminate()) {
-            Ok(mut signal) => {
-                signal.recv().await;
-            }
-            Err(_) => std::future::pending().await,
-        }
-    };
-    tokio::select! {
-        () = terminate => {}
-        _ = tokio::signal::ctrl_c() => {}
+    match stop_signal() {
+        Ok(signal) => signal.await,
+        Err(_) => std::future::pending().await,
     }
 }
 

@@ -43,7 +43,7 @@ pub(super) async fn list(request: RequestContext) -> Result<Response> {
                 .into_iter()
                 .map(|which| networks::carried(which).name)
                 .collect(),
-            priors: name.priors().iter().map(|prior| prior.as_str()).collect(),
+            priors: name.priors().iter().map(|&prior| prior.into()).collect(),
             planned_iterations: schedule.planned_iterations(),
             planned_passes: schedule.planned_passes(),
             schedule,

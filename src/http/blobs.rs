@@ -7,7 +7,6 @@ use axum::extract::{FromRequest, Multipart, Request};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ContentLength, HeaderMapExt};
-use serde::Deserialize;
 
 use super::access::Access;
 use super::admission::Reservation;
@@ -16,7 +15,7 @@ use super::context::{RequestContext, changed};
 use super::download::Download;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, check_digest, check_encoding, content_digest};
-use super::page::{Cursor, Limit, PageBody};
+use super::page::{Cursor, PageBody, PageQuery};
 use super::shares;
 use super::upload;
 use engine::job::{Lab, Sha256, Timestamp};
@@ -69,18 +68,10 @@ impl FromStr for Position {
     }
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<Cursor<Position>>,
-}
-
 /// `GET /v1/blobs`: the lab's files, newest first.
 pub(super) async fn list(
     Caller(app, access): Caller,
-    QueryOf(query): QueryOf<ListQuery>,
+    QueryOf(query): QueryOf<PageQuery<Position>>,
     request: RequestContext,
 ) -> Result<Response> {
     let after = query.cursor.map(|Cursor(Position(time, sha256))| (time, sha256));
@@ -118,8 +109,7 @@ pub(super) async fn delete(
     Params(sha256): Params<Sha256>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition((&app.changes, &access.lab), body(&app, &access, sha256)).await?;
+    let _guard = request.precondition(&app, &access.lab, body(&app, &access, sha256)).await?;
     app.store.delete_upload(&access.lab, sha256).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -46,6 +46,15 @@ impl Limit {
     }
 }
 
+/// The query of a list that is not filtered.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, bound = "Id: FromStr")]
+pub(super) struct PageQuery<Id> {
+    #[serde(default)]
+    pub(super) limit: Limit,
+    pub(super) cursor: Option<Cursor<Id>>,
+}
+
 /// The query of a list of resources that belong to calibrations.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, bound = "Id: FromStr")]

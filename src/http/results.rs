@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use axum::response::Response;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::app::App;
 use super::context::RequestContext;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, canonical_number};
 use super::jobs::with_snapshot;
-use super::page::{Cursor, Limit, PageBody};
+use super::page::{Cursor, PageBody, PageQuery};
 use engine::job::{JobId, JobState, ResultFile, WrittenFile};
 use engine::pipeline::records::WhiteRecord;
 use store::{Job, Page, StoreError};
@@ -34,19 +34,11 @@ struct FileBody {
     href: Option<String>,
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<Cursor<u32>>,
-}
-
 /// `GET /v1/jobs/{job}/snapshots`: the snapshots of a job, by index.
 pub(super) async fn list(
     Caller(app, access): Caller,
     Params(id): Params<JobId>,
-    QueryOf(query): QueryOf<ListQuery>,
+    QueryOf(query): QueryOf<PageQuery<u32>>,
     request: RequestContext,
 ) -> Result<Response> {
     let job = app.store.job(&access.lab, id).await?;

@@ -1,4 +1,4 @@
-//! A deserializer that accepts only objects for structs, and names arrays that are too long for a tuple.
+//! A deserializer of JSON that accepts only objects for structs, and names arrays that are too long for a tuple.
 //!
 //! Derived implementations also accept an array with the fields in order, which the API description does not allow. After
 //! the last item of a tuple the parser expects the end of the array, and takes more items for malformed JSON.
@@ -11,50 +11,38 @@ use serde::de::{
 /// Wraps a deserializer, visitor or accessor, so that every struct inside it must be an object.
 pub(super) struct Strict<T>(pub(super) T);
 
-macro_rules! forward {
-    ($($method:ident($($argument:ident: $kind:ty),*);)*) => {
-        $(fn $method<V: Visitor<'de>>(
-            self,
-            $($argument: $kind,)*
-            visitor: V,
-        ) -> Result<V::Value, D::Error> {
-            self.0.$method($($argument,)* Strict(visitor))
-        })*
-    };
-}
-
 impl<'de, D: Deserializer<'de>> Deserializer<'de> for Strict<D> {
     type Error = D::Error;
 
-    forward! {
-        deserialize_any();
-        deserialize_bool();
-        deserialize_i8();
-        deserialize_i16();
-        deserialize_i32();
-        deserialize_i64();
-        deserialize_i128();
-        deserialize_u8();
-        deserialize_u16();
-        deserialize_u32();
-        deserialize_u64();
-        deserialize_u128();
-        deserialize_f32();
-        deserialize_f64();
-        deserialize_char();
-        deserialize_str();
-        deserialize_string();
-        deserialize_bytes();
-        deserialize_byte_buf();
-        deserialize_option();
-        deserialize_unit();
-        deserialize_unit_struct(name: &'static str);
-        deserialize_newtype_struct(name: &'static str);
-        deserialize_seq();
-        deserialize_map();
-        deserialize_enum(name: &'static str, variants: &'static [&'static str]);
-        deserialize_identifier();
-        deserialize_ignored_any();
+    // JSON describes itself, so that the other hints change nothing.
+    serde::forward_to_deserialize_any! {
+        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf unit unit_struct seq map
+        identifier ignored_any
+    }
+
+    fn deserialize_any<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
+        self.0.deserialize_any(Strict(visitor))
+    }
+
+    fn deserialize_option<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, D::Error> {
+        self.0.deserialize_option(Strict(visitor))
+    }
+
+    fn deserialize_newtype_struct<V: Visitor<'de>>(
+        self,
+        name: &'static str,
+        visitor: V,
+    ) -> Result<V::Value, D::Error> {
+        self.0.deserialize_newtype_struct(name, Strict(visitor))
+    }
+
+    fn deserialize_enum<V: Visitor<'de>>(
+        self,
+        name: &'static str,
+        variants: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, D::Error> {
+        self.0.deserialize_enum(name, variants, Strict(visitor))
     }
 
     fn deserialize_tuple<V: Visitor<'de>>(

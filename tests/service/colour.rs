@@ -6,7 +6,6 @@ use std::process::Command;
 use serde_json::{Value, json};
 
 use crate::app::{Answer, TestApp, id, judges};
-#[cfg(feature = "nats")]
 use crate::cluster::nodes::{Nats, RemoteWorker};
 use crate::exports::judge_movies;
 use crate::faults::results_of;
@@ -273,7 +272,6 @@ async fn workers_and_the_command_line_give_the_same_colours() {
         let file = lab.path("out").join(format!("snapshot_000{name}"));
         assert_eq!(crate::faults::sha256(&std::fs::read(file).unwrap()), *sha256, "{name}");
     }
-    #[cfg(feature = "nats")]
     if let Some(nats) = Nats::start(1) {
         let app =
             TestApp::with(&["--workers", "0", "--nats", &nats.url(), "--ack-wait", "5"]).await;

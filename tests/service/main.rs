@@ -14,7 +14,6 @@ mod checks;
 mod cli;
 mod client_libraries;
 mod clients;
-#[cfg(feature = "nats")]
 mod cluster;
 mod colour;
 mod commands;

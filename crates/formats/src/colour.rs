@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::open::open;
-use super::photo::{Photo, read_picture};
-use super::{Format, FrameReader, Limits, npy, png};
+use super::photo::{self, read_picture};
+use super::{Format, Limits, Reader, npy, png};
 use crate::error::Result;
 
 /// Opens a colour clip: npy (frame, row, column, 3) in C order, or a picture in colours: a PNG with 8 or 16 bits per
@@ -12,22 +12,18 @@ use crate::error::Result;
 /// `None` if the file is not in colour.
 ///
 /// Errors: as [`super::open_stack`].
-pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Box<dyn FrameReader + Send>>> {
+pub fn open_colours(path: &Path, limits: &Limits) -> Result<Option<Reader>> {
     let (file, length, format) = open(path, "mask")?;
     limits.check_file(format, length)?;
     Ok(match format {
         Format::Npy => {
             let reader = npy::open_colours(file, length, limits)?;
-            reader.map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
+            reader.map(|reader| Box::new(reader) as Reader)
         }
-        Format::Png => {
-            let reader = png::PngReader::open_colours(file, length, limits)?;
-            reader.map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
-        }
+        Format::Png => png::open_colours(file, length, limits)?,
         Format::Jpeg | Format::Bmp | Format::Pnm => {
             let bytes = read_picture(file, (format, length))?;
-            let reader = Photo::open_colours(&bytes, format, limits)?;
-            reader.map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
+            photo::open_colours(&bytes, format, limits)?
         }
         _ => None,
     })

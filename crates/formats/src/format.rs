@@ -11,8 +11,6 @@ pub(super) const PLANAR_MAGIC: &[u8] = b"SCIPLNR\0";
 
 /// Number of first bytes that identify all formats.
 pub(super) const HEAD_BYTES: u64 = 512;
-/// Offset and start of the signature of a tar archive.
-const TAR_MAGIC: (usize, &[u8]) = (257, b"ustar");
 
 /// Signatures of JPEG 2000, as a file and as a stream.
 const JPEG_2000: [&[u8]; 2] = [b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51"];
@@ -67,44 +65,33 @@ pub enum Format {
 impl Format {
     /// Determines the format from the first [`HEAD_BYTES`] of a file. An npz file is reported as ZIP.
     pub(super) fn sniff(head: &[u8]) -> Option<Self> {
-        const BIG_ENDIAN_MAT: &[u8] = &[1, 0, b'M', b'I'];
-        const LITTLE_ENDIAN_MAT: &[u8] = &[0, 1, b'I', b'M'];
-        let tiff: [&[u8]; 4] = [b"II\x2a\0", b"II\x2b\0", b"MM\0\x2a", b"MM\0\x2b"];
-        if head.starts_with(NPY_MAGIC) {
-            Some(Self::Npy)
-        } else if tiff.iter().any(|magic| head.starts_with(magic)) {
-            Some(Self::Tiff)
-        } else if head.starts_with(b"\x89PNG\r\n\x1a\n") {
-            Some(Self::Png)
-        } else if head.starts_with(b"\xff\xd8\xff") {
-            Some(Self::Jpeg)
-        } else if head.starts_with(HDF5_MAGIC) || head.starts_with(b"MATLAB 7.3") {
-            Some(Self::Hdf5)
-        } else if head.starts_with(b"PK\x03\x04") || head.starts_with(b"PK\x05\x06") {
-            Some(Self::Zip)
-        } else if head.get(TAR_MAGIC.0..).is_some_and(|head| head.starts_with(TAR_MAGIC.1)) {
-            Some(Self::Tar)
-        } else if head.starts_with(&[0x76, 0x2f, 0x31, 0x01]) {
-            Some(Self::Exr)
-        } else if head.starts_with(PLANAR_MAGIC) {
-            Some(Self::Planar)
-        } else {
-            match head.get(124..128) {
-                Some(version) if version == LITTLE_ENDIAN_MAT || version == BIG_ENDIAN_MAT => {
-                    Some(Self::Mat)
-                }
-                // Short signatures last.
-                _ if head.starts_with(b"BM") => Some(Self::Bmp),
-                _ if matches!(
-                    head,
-                    [b'P', b'1'..=b'7', b' ' | b'\n' | b'\r' | b'\t' | b'#', ..]
-                ) =>
-                {
-                    Some(Self::Pnm)
-                }
-                _ => None,
-            }
-        }
+        // Offset and signature; short signatures last.
+        const SIGNATURES: [(usize, &[u8], Format); 18] = [
+            (0, NPY_MAGIC, Format::Npy),
+            (0, b"II\x2a\0", Format::Tiff),
+            (0, b"II\x2b\0", Format::Tiff),
+            (0, b"MM\0\x2a", Format::Tiff),
+            (0, b"MM\0\x2b", Format::Tiff),
+            (0, b"\x89PNG\r\n\x1a\n", Format::Png),
+            (0, b"\xff\xd8\xff", Format::Jpeg),
+            (0, HDF5_MAGIC, Format::Hdf5),
+            (0, b"MATLAB 7.3", Format::Hdf5),
+            (0, b"PK\x03\x04", Format::Zip),
+            (0, b"PK\x05\x06", Format::Zip),
+            (257, b"ustar", Format::Tar),
+            (0, b"\x76\x2f\x31\x01", Format::Exr),
+            (0, PLANAR_MAGIC, Format::Planar),
+            // Version and byte order of a MATLAB file.
+            (124, b"\0\x01IM", Format::Mat),
+            (124, b"\x01\0MI", Format::Mat),
+            (0, b"BM", Format::Bmp),
+            (0, b"P", Format::Pnm),
+        ];
+        let is_pnm = matches!(head, [_, b'1'..=b'7', b' ' | b'\n' | b'\r' | b'\t' | b'#', ..]);
+        let found = SIGNATURES.iter().find(|(offset, signature, _)| {
+            head.get(*offset..).is_some_and(|head| head.starts_with(signature))
+        });
+        found.map(|(.., format)| *format).filter(|format| *format != Self::Pnm || is_pnm)
     }
 }
 

@@ -26,7 +26,7 @@ use super::array::{self, ArrayReader, Samples};
 use super::axes::{Expected, Writer};
 use super::samples::{self, ByteOrder};
 use super::scene::{MAX_NAMES, SceneArray, list};
-use super::{Format, FormatError, FrameReader, Limits, SampleType, limits};
+use super::{Format, FormatError, Limits, Reader, SampleType, limits};
 use crate::error::Result;
 
 /// Size of the cache of decoded chunks, in bytes. If the chunks of a frame fit, each chunk is decoded once for all its
@@ -100,7 +100,7 @@ pub(super) fn open(
     file: File,
     (array, name, expected): (SceneArray, &str, &Expected),
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let mut advice = Advice { name: python_name(name) };
     let error = |source| advice.error(source);
     let file = open_file(file).map_err(error)?;

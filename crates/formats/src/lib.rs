@@ -56,5 +56,5 @@ pub use natural::natural_key;
 pub use open::{Wanted, collect, open_array, open_file, open_shown, open_stack, read_stack};
 pub use part::{Crop, Packing, Part};
 pub use samples::StackWriter;
-pub use stack::{FrameReader, Frames, FullScale, SampleType, StackInfo};
+pub use stack::{FrameReader, Frames, FullScale, Reader, SampleType, StackInfo};
 pub use window::WindowReader;

@@ -81,14 +81,9 @@ pub(super) fn distinct(members: Vec<Member>, format: Format) -> Result<Vec<Membe
 pub(super) struct MemberReader {
     archive: Arc<File>,
     member: Member,
-    source: Source,
+    source: Box<dyn Read + Send>,
     remaining: u64,
     crc: Crc,
-}
-
-enum Source {
-    Stored(Section),
-    Deflated(DeflateDecoder<BufReader<Section>>),
 }
 
 /// A section of a file. Reads are positional, so readers can share the file.
@@ -98,20 +93,19 @@ struct Section {
     end: u64,
 }
 
-impl Source {
-    fn new(file: &Arc<File>, member: &Member) -> Self {
-        let (file, position) = (Arc::clone(file), member.start);
-        let section = Section { file, position, end: position + member.stored };
-        match member.packing {
-            Packing::Stored => Self::Stored(section),
-            Packing::Deflated => Self::Deflated(DeflateDecoder::new(BufReader::new(section))),
-        }
+/// The decompressed content of a member.
+fn content(file: &Arc<File>, member: &Member) -> Box<dyn Read + Send> {
+    let (file, position) = (Arc::clone(file), member.start);
+    let section = Section { file, position, end: position + member.stored };
+    match member.packing {
+        Packing::Stored => Box::new(section),
+        Packing::Deflated => Box::new(DeflateDecoder::new(BufReader::new(section))),
     }
 }
 
 impl MemberReader {
     pub(super) fn new(archive: Arc<File>, member: Member) -> Self {
-        let (source, remaining) = (Source::new(&archive, &member), member.size);
+        let (source, remaining) = (content(&archive, &member), member.size);
         Self { archive, member, source, remaining, crc: Crc::new() }
     }
 
@@ -147,19 +141,10 @@ impl Read for MemberReader {
 
 impl Restart for MemberReader {
     fn restart(&mut self) -> io::Result<()> {
-        self.source = Source::new(&self.archive, &self.member);
+        self.source = content(&self.archive, &self.member);
         self.remaining = self.member.size;
         self.crc = Crc::new();
         Ok(())
-    }
-}
-
-impl Read for Source {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        match self {
-            Self::Stored(section) => section.read(buffer),
-            Self::Deflated(decoder) => decoder.read(buffer),
-        }
     }
 }
 

@@ -7,7 +7,7 @@ use super::axes::Expected;
 use super::member::{Member, MemberReader};
 use super::npy;
 use super::scene::{MAX_NAMES, SceneArray, list};
-use super::{Format, FormatError, FrameReader, Limits};
+use super::{Format, FormatError, Limits, Reader};
 use crate::error::Result;
 
 /// Extension of all members.
@@ -21,7 +21,7 @@ pub(super) fn open(
     members: Vec<Member>,
     (array, name, expected): (SceneArray, Option<&str>, &Expected),
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let mut arrays: Vec<(String, Member)> = members
         .into_iter()
         .filter_map(|member| Some((member.name.strip_suffix(EXTENSION)?.to_owned(), member)))

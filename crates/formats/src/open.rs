@@ -10,12 +10,12 @@ use ndarray::Array3;
 
 use super::format::{HDF5_MAGIC, HEAD_BYTES, describe};
 use super::mat::{self, SceneArray};
-use super::photo::{Photo, read_picture};
+use super::photo::{self, read_picture};
 use super::pictures::Pictures;
 use super::scene::list;
 use super::{
-    Axes, Expected, Format, FormatError, FrameReader, Limits, Packing, Part, StackInfo, hdf5, npy,
-    npz, png, tar, tiff, zip,
+    Axes, Expected, Format, FormatError, FrameReader, Limits, Packing, Part, Reader, StackInfo,
+    hdf5, npy, npz, png, tar, tiff, zip,
 };
 use crate::error::Result;
 
@@ -57,14 +57,14 @@ impl From<SceneArray> for Wanted<'_> {
 /// - ZIP and tar: numbered pictures
 ///
 /// Errors: [`FormatError`].
-pub fn open_stack(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
+pub fn open_stack(path: &Path, limits: &Limits) -> Result<Reader> {
     open_any(path, None, false, limits)
 }
 
 /// Opens a stack of frames to be looked at: as [`open_stack`], or 8-bit pictures in JPEG, BMP or PNM.
 ///
 /// Errors: [`FormatError`].
-pub fn open_shown(path: &Path, limits: &Limits) -> Result<Box<dyn FrameReader + Send>> {
+pub fn open_shown(path: &Path, limits: &Limits) -> Result<Reader> {
     open_any(path, None, true, limits)
 }
 
@@ -81,7 +81,7 @@ pub fn open_array<'a>(
     path: &Path,
     wanted: impl Into<Wanted<'a>>,
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let mut wanted = wanted.into();
     let photos = wanted.array == SceneArray::Truth;
     let Some(packing) = wanted.packing else {
@@ -106,7 +106,7 @@ fn open_any(
     wanted: Option<Wanted<'_>>,
     photos: bool,
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let name = wanted.map_or("mask", |wanted| wanted.name.unwrap_or(wanted.array.name()));
     let (mut file, length, format) = open(path, name)?;
     limits.check_file(format, length)?;
@@ -128,15 +128,15 @@ fn open_any(
     if format == Format::Npy {
         return Ok(Box::new(npy::open(file, length, (format, &expected), limits)?));
     }
-    let reader: Box<dyn FrameReader + Send> = match format {
+    let reader: Reader = match format {
         Format::Tiff => tiff::open(file, length, limits)?,
-        Format::Png => Box::new(png::PngReader::open(file, length, limits)?),
+        Format::Png => png::open(file, length, limits)?,
         Format::Tar => {
             let members = (format, tar::members(&file, length)?);
             Box::new(Pictures::open(Arc::new(file), members, photos, limits)?)
         }
         Format::Jpeg | Format::Bmp | Format::Pnm if photos => {
-            Box::new(Photo::open(&read_picture(file, (format, length))?, format, limits)?)
+            photo::open(&read_picture(file, (format, length))?, format, limits)?
         }
         Format::Jpeg | Format::Bmp | Format::Pnm => {
             return Err(unknown(describe(&head(&mut file)?, name)));
@@ -198,7 +198,7 @@ fn open_zip(
     length: u64,
     (wanted, photos): (Option<Wanted<'_>>, bool),
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let members = zip::members(&file, length)?;
     let arrays = members.iter().filter(|member| member.name.ends_with(npz::EXTENSION)).count();
     match wanted {
@@ -223,10 +223,7 @@ fn open_zip(
 }
 
 /// Returns a reader of pictures unless other axes are stated. Errors: [`FormatError::NoAxes`].
-fn check_picture_axes(
-    reader: Box<dyn FrameReader + Send>,
-    expected: &Expected,
-) -> Result<Box<dyn FrameReader + Send>> {
+fn check_picture_axes(reader: Reader, expected: &Expected) -> Result<Reader> {
     match expected.axes {
         None | Some(Axes::FrameRowColumn) => Ok(reader),
         Some(_) => Err(FormatError::NoAxes(reader.info().format)),

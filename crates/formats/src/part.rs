@@ -7,10 +7,8 @@ use ndarray::s;
 use serde::{Deserialize, Serialize};
 use strum::{Display, EnumString, VariantNames};
 
-use super::{Format, FormatError, FrameReader, Frames, Limits, SampleType, StackInfo, samples};
+use super::{Format, FormatError, Frames, Limits, Reader, SampleType, StackInfo, samples};
 use crate::error::Result;
-
-type Reader = Box<dyn FrameReader + Send>;
 
 /// A window of pixels, counted from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]

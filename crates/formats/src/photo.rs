@@ -5,11 +5,11 @@ use std::io::{Cursor, ErrorKind, Read};
 
 use image::metadata::Orientation;
 use image::{ColorType, DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
-use ndarray::Array2;
 
 use super::limits::check;
-use super::samples::read_error;
-use super::{Channels, Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use super::samples::{frame, read_error};
+use super::stack::one_frame;
+use super::{Channels, Format, FormatError, Limits, Reader, SampleType, StackInfo};
 use crate::error::Result;
 
 /// Largest length of a picture in bytes, which is read into memory as a whole: a frame of the largest sides in 16 bits,
@@ -19,84 +19,65 @@ pub(super) const MAX_PICTURE_BYTES: u64 = 160 << 20;
 /// The bytes after the last row of a JPEG.
 const END_OF_JPEG: [u8; 2] = [0xff, 0xd9];
 
-/// A decoded picture.
-pub(super) struct Photo {
-    frame: Option<Array2<f32>>,
-    info: StackInfo,
-}
-
-impl Photo {
-    /// Decodes a grey picture. One in colours counts as grey if its channels are equal, as in a BMP with a grey palette.
-    pub(super) fn open(bytes: &[u8], format: Format, limits: &Limits) -> Result<Self> {
-        match Self::decode(bytes, format, limits)? {
-            (Channels::Grey, photo) => Ok(photo),
-            (Channels::Rgb, _) => Err(unsupported(format, "colours".to_owned())),
-        }
-    }
-
-    /// Decodes a picture in colours; `None` for a grey one.
-    pub(super) fn open_colours(
-        bytes: &[u8],
-        format: Format,
-        limits: &Limits,
-    ) -> Result<Option<Self>> {
-        let (channels, photo) = Self::decode(bytes, format, limits)?;
-        Ok((channels == Channels::Rgb).then_some(photo))
-    }
-
-    fn decode(bytes: &[u8], format: Format, limits: &Limits) -> Result<(Channels, Self)> {
-        let kind = match format {
-            Format::Jpeg => ImageFormat::Jpeg,
-            Format::Bmp => ImageFormat::Bmp,
-            Format::Pnm => ImageFormat::Pnm,
-            other => return Err(FormatError::Internal(format!("{other} is not such a picture"))),
-        };
-        // The decoder would fill the missing rows of a JPEG.
-        let content = bytes.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
-        if format == Format::Jpeg && !bytes[..content].ends_with(&END_OF_JPEG) {
-            return Err(cut(format));
-        }
-        let mut decoder = ImageReader::with_format(Cursor::new(bytes), kind)
-            .into_decoder()
-            .map_err(|error| decoding_error(format, error))?;
-        let (width, height) = decoder.dimensions();
-        limits.check_shape(format, 1, height.into(), width.into())?;
-        let turned = decoder.orientation().map_err(|error| decoding_error(format, error))?;
-        if turned != Orientation::NoTransforms {
-            return Err(unsupported(format, "a picture that is turned for display".to_owned()));
-        }
-        let color = decoder.color_type();
-        if !matches!(color, ColorType::L8 | ColorType::Rgb8) {
-            return Err(unsupported(format, format!("{color:?} pixels")));
-        }
-        let picture =
-            DynamicImage::from_decoder(decoder).map_err(|error| decoding_error(format, error))?;
-        let levels = picture.into_bytes();
-        let is_grey = |pixel: &[u8]| pixel[0] == pixel[1] && pixel[1] == pixel[2];
-        let (channels, levels) = match color {
-            ColorType::Rgb8 if levels.chunks_exact(3).all(is_grey) => {
-                (Channels::Grey, levels.into_iter().step_by(3).collect())
-            }
-            ColorType::Rgb8 => (Channels::Rgb, levels),
-            _ => (Channels::Grey, levels),
-        };
-        let (height, samples) = (height as usize, width as usize * channels.count());
-        let info = StackInfo::new(format, SampleType::U8, 1, height, samples);
-        let values = levels.into_iter().map(f32::from).collect();
-        let frame = Array2::from_shape_vec((height, samples), values)
-            .map_err(|error| FormatError::Internal(error.to_string()))?;
-        Ok((channels, Self { frame: Some(frame), info }))
+/// Opens a grey picture. One in colours counts as grey if its channels are equal, as in a BMP with a grey palette.
+pub(super) fn open(bytes: &[u8], format: Format, limits: &Limits) -> Result<Reader> {
+    match decode(bytes, format, limits)? {
+        (Channels::Grey, reader) => Ok(reader),
+        (Channels::Rgb, _) => Err(unsupported(format, "colours".to_owned())),
     }
 }
 
-impl FrameReader for Photo {
-    fn info(&self) -> &StackInfo {
-        &self.info
-    }
+/// Opens a picture in colours; `None` for a grey one.
+pub(super) fn open_colours(
+    bytes: &[u8],
+    format: Format,
+    limits: &Limits,
+) -> Result<Option<Reader>> {
+    let (channels, reader) = decode(bytes, format, limits)?;
+    Ok((channels == Channels::Rgb).then_some(reader))
+}
 
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        Ok(self.frame.take())
+fn decode(bytes: &[u8], format: Format, limits: &Limits) -> Result<(Channels, Reader)> {
+    let kind = match format {
+        Format::Jpeg => ImageFormat::Jpeg,
+        Format::Bmp => ImageFormat::Bmp,
+        Format::Pnm => ImageFormat::Pnm,
+        other => return Err(FormatError::Internal(format!("{other} is not such a picture"))),
+    };
+    // The decoder would fill the missing rows of a JPEG.
+    let content = bytes.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
+    if format == Format::Jpeg && !bytes[..content].ends_with(&END_OF_JPEG) {
+        return Err(cut(format));
     }
+    let mut decoder = ImageReader::with_format(Cursor::new(bytes), kind)
+        .into_decoder()
+        .map_err(|error| decoding_error(format, error))?;
+    let (width, height) = decoder.dimensions();
+    limits.check_shape(format, 1, height.into(), width.into())?;
+    let turned = decoder.orientation().map_err(|error| decoding_error(format, error))?;
+    if turned != Orientation::NoTransforms {
+        return Err(unsupported(format, "a picture that is turned for display".to_owned()));
+    }
+    let color = decoder.color_type();
+    if !matches!(color, ColorType::L8 | ColorType::Rgb8) {
+        return Err(unsupported(format, format!("{color:?} pixels")));
+    }
+    let picture =
+        DynamicImage::from_decoder(decoder).map_err(|error| decoding_error(format, error))?;
+    let levels = picture.into_bytes();
+    let is_grey = |pixel: &[u8]| pixel[0] == pixel[1] && pixel[1] == pixel[2];
+    let (channels, levels) = match color {
+        ColorType::Rgb8 if levels.chunks_exact(3).all(is_grey) => {
+            (Channels::Grey, levels.into_iter().step_by(3).collect())
+        }
+        ColorType::Rgb8 => (Channels::Rgb, levels),
+        _ => (Channels::Grey, levels),
+    };
+    let (height, samples) = (height as usize, width as usize * channels.count());
+    let info = StackInfo::new(format, SampleType::U8, 1, height, samples);
+    let values = levels.into_iter().map(f32::from).collect();
+    let frame = frame(height, samples, values)?;
+    Ok((channels, one_frame(info, || Ok(frame))))
 }
 
 /// Reads a picture of `length` bytes into memory. Errors: above [`MAX_PICTURE_BYTES`].

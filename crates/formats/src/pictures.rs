@@ -8,10 +8,8 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use super::member::{Member, MemberReader, quoted};
-use super::photo::{Photo, read_picture};
-use super::png::PngReader;
-use super::tiff;
-use super::{Format, FormatError, FrameReader, Limits, StackInfo};
+use super::photo::{self, read_picture};
+use super::{Format, FormatError, FrameReader, Limits, Reader, StackInfo, png, tiff};
 use crate::error::Result;
 
 /// Reads the pictures of an archive as frames.
@@ -78,17 +76,15 @@ fn picture(
     (format, member): (Format, &Member),
     photos: bool,
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let content = MemberReader::new(Arc::clone(archive), member.clone());
     let bytes = read_picture(content, (format, member.size)).map_err(in_member(&member.name))?;
     let length = bytes.len() as u64;
-    let reader: Result<Box<dyn FrameReader + Send>> = match Format::sniff(&bytes) {
-        Some(Format::Png) => PngReader::open(Cursor::new(bytes), length, limits)
-            .map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>),
+    let reader: Result<Reader> = match Format::sniff(&bytes) {
+        Some(Format::Png) => png::open(Cursor::new(bytes), length, limits),
         Some(Format::Tiff) => tiff::open(Cursor::new(bytes), length, limits),
         Some(kind @ (Format::Jpeg | Format::Bmp | Format::Pnm)) if photos => {
-            Photo::open(&bytes, kind, limits)
-                .map(|reader| Box::new(reader) as Box<dyn FrameReader + Send>)
+            photo::open(&bytes, kind, limits)
         }
         _ => Err(unsupported(
             format,

@@ -5,10 +5,10 @@ use std::io::{BufReader, ErrorKind, Read, Seek};
 use ::png::{
     BitDepth, ColorType, Decoder, DecodingError, Limits as DecoderLimits, Transformations,
 };
-use ndarray::Array2;
 
 use super::samples::{self, ByteOrder};
-use super::{Channels, Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use super::stack::one_frame;
+use super::{Channels, Format, FormatError, Limits, Reader, SampleType, StackInfo};
 use crate::error::Result;
 
 /// Largest expansion of Deflate in bytes per compressed byte.
@@ -17,70 +17,38 @@ const MAX_EXPANSION: u64 = 1032;
 /// Memory for the buffers of the decoder, and for chunks other than pixels.
 const DECODER_BYTES: usize = 16 << 20;
 
-/// Reads a PNG as a stack of one frame.
-pub(super) struct PngReader<R: Read + Seek> {
-    decoder: Option<::png::Reader<BufReader<R>>>,
-    info: StackInfo,
+/// Opens a grey PNG of `length` bytes, and checks its header against the limits and the length. Gamma and colour profiles
+/// are ignored.
+pub(super) fn open<R: Read + Seek + Send + 'static>(
+    file: R,
+    length: u64,
+    limits: &Limits,
+) -> Result<Reader> {
+    let mut decoder = decoder(file);
+    let header = decoder.read_header_info().map_err(decoding_error)?;
+    let sample = match (header.color_type, header.bit_depth) {
+        (ColorType::Grayscale, BitDepth::One) => SampleType::Bool,
+        (ColorType::Grayscale, BitDepth::Eight) => SampleType::U8,
+        (ColorType::Grayscale, BitDepth::Sixteen) => SampleType::U16,
+        (color, depth) => return Err(unsupported(format!("{color:?}, {depth:?} bit"))),
+    };
+    reader(decoder, (sample, Channels::Grey), length, limits)
 }
 
-impl<R: Read + Seek> PngReader<R> {
-    /// Opens a grey PNG of `length` bytes, and checks its header against the limits and the length. Gamma and colour
-    /// profiles are ignored.
-    pub(super) fn open(file: R, length: u64, limits: &Limits) -> Result<Self> {
-        let mut decoder = decoder(file);
-        let header = decoder.read_header_info().map_err(decoding_error)?;
-        let sample = match (header.color_type, header.bit_depth) {
-            (ColorType::Grayscale, BitDepth::One) => SampleType::Bool,
-            (ColorType::Grayscale, BitDepth::Eight) => SampleType::U8,
-            (ColorType::Grayscale, BitDepth::Sixteen) => SampleType::U16,
-            (color, depth) => return Err(unsupported(format!("{color:?}, {depth:?} bit"))),
-        };
-        Self::new(decoder, (sample, Channels::Grey), length, limits)
-    }
-
-    /// Opens an RGB PNG; `None` for a PNG in other colours.
-    pub(super) fn open_colours(file: R, length: u64, limits: &Limits) -> Result<Option<Self>> {
-        let mut decoder = decoder(file);
-        let header = decoder.read_header_info().map_err(decoding_error)?;
-        let sample = match (header.color_type, header.bit_depth) {
-            (ColorType::Rgb, BitDepth::Eight) => SampleType::U8,
-            (ColorType::Rgb, BitDepth::Sixteen) => SampleType::U16,
-            _ => return Ok(None),
-        };
-        Self::new(decoder, (sample, Channels::Rgb), length, limits).map(Some)
-    }
-
-    fn new(
-        mut decoder: Decoder<BufReader<R>>,
-        (sample, channels): (SampleType, Channels),
-        length: u64,
-        limits: &Limits,
-    ) -> Result<Self> {
-        let header = decoder.read_header_info().map_err(decoding_error)?;
-        let (height, width) = (header.height, header.width);
-        limits.check_shape(Format::Png, 1, height.into(), width.into())?;
-        let samples = width as usize * channels.count();
-        let info = StackInfo::new(Format::Png, sample, 1, height as usize, samples);
-        let promised = (row_bytes(&info) * info.height) as u64;
-        if length.saturating_mul(MAX_EXPANSION) < promised {
-            return Err(FormatError::Truncated {
-                format: Format::Png,
-                promised: format!("{height}x{width} {sample} ({promised} bytes of pixels)"),
-                present: format!("{length} bytes, too few even for perfect compression"),
-            });
-        }
-        let reader = decoder.read_info().map_err(decoding_error)?;
-        if reader.info().animation_control.is_some() {
-            return Err(FormatError::Unsupported {
-                format: Format::Png,
-                found: "an animation".to_owned(),
-                accepted: "one image (to convert all frames: python -c \"import numpy; from PIL import Image, \
-                           ImageSequence; numpy.save('out.npy', [numpy.array(p if p.mode == 'I;16' else p.convert('L')) for p in \
-                           ImageSequence.Iterator(Image.open('in.png'))])\")",
-            });
-        }
-        Ok(Self { decoder: Some(reader), info })
-    }
+/// Opens an RGB PNG; `None` for a PNG in other colours.
+pub(super) fn open_colours<R: Read + Seek + Send + 'static>(
+    file: R,
+    length: u64,
+    limits: &Limits,
+) -> Result<Option<Reader>> {
+    let mut decoder = decoder(file);
+    let header = decoder.read_header_info().map_err(decoding_error)?;
+    let sample = match (header.color_type, header.bit_depth) {
+        (ColorType::Rgb, BitDepth::Eight) => SampleType::U8,
+        (ColorType::Rgb, BitDepth::Sixteen) => SampleType::U16,
+        _ => return Ok(None),
+    };
+    reader(decoder, (sample, Channels::Rgb), length, limits).map(Some)
 }
 
 /// A decoder that returns the stored values.
@@ -93,25 +61,46 @@ fn decoder<R: Read + Seek>(file: R) -> Decoder<BufReader<R>> {
     decoder
 }
 
-impl<R: Read + Seek> FrameReader for PngReader<R> {
-    fn info(&self) -> &StackInfo {
-        &self.info
+fn reader<R: Read + Seek + Send + 'static>(
+    mut decoder: Decoder<BufReader<R>>,
+    (sample, channels): (SampleType, Channels),
+    length: u64,
+    limits: &Limits,
+) -> Result<Reader> {
+    let header = decoder.read_header_info().map_err(decoding_error)?;
+    let (height, width) = (header.height, header.width);
+    limits.check_shape(Format::Png, 1, height.into(), width.into())?;
+    let samples = width as usize * channels.count();
+    let info = StackInfo::new(Format::Png, sample, 1, height as usize, samples);
+    let promised = (row_bytes(&info) * info.height) as u64;
+    if length.saturating_mul(MAX_EXPANSION) < promised {
+        return Err(FormatError::Truncated {
+            format: Format::Png,
+            promised: format!("{height}x{width} {sample} ({promised} bytes of pixels)"),
+            present: format!("{length} bytes, too few even for perfect compression"),
+        });
     }
-
-    fn next_frame(&mut self) -> Result<Option<Array2<f32>>> {
-        let Some(mut decoder) = self.decoder.take() else {
-            return Ok(None);
-        };
-        let StackInfo { height, width, sample, .. } = self.info;
-        let mut bytes = vec![0; row_bytes(&self.info) * height];
-        decoder.next_frame(&mut bytes).map_err(decoding_error)?;
+    let mut reader = decoder.read_info().map_err(decoding_error)?;
+    if reader.info().animation_control.is_some() {
+        return Err(FormatError::Unsupported {
+            format: Format::Png,
+            found: "an animation".to_owned(),
+            accepted: "one image (to convert all frames: python -c \"import numpy; from PIL import Image, \
+                       ImageSequence; numpy.save('out.npy', [numpy.array(p if p.mode == 'I;16' else p.convert('L')) for p in \
+                       ImageSequence.Iterator(Image.open('in.png'))])\")",
+        });
+    }
+    Ok(one_frame(info, move || {
+        let StackInfo { height, width, sample, .. } = info;
+        let mut bytes = vec![0; row_bytes(&info) * height];
+        reader.next_frame(&mut bytes).map_err(decoding_error)?;
         if sample == SampleType::Bool {
             let row =
                 |row: &[u8]| (0..width).map(|j| row[j / 8] >> (7 - j % 8) & 1).collect::<Vec<_>>();
-            bytes = bytes.chunks_exact(row_bytes(&self.info)).flat_map(row).collect();
+            bytes = bytes.chunks_exact(row_bytes(&info)).flat_map(row).collect();
         }
-        samples::frame(height, width, samples::decode(&bytes, sample, ByteOrder::Big)).map(Some)
-    }
+        samples::frame(height, width, samples::decode(&bytes, sample, ByteOrder::Big))
+    }))
 }
 
 /// Number of bytes of a stored row. Rows of 1-bit pixels start at whole bytes.

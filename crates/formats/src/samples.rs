@@ -17,29 +17,27 @@ pub(super) enum ByteOrder {
 
 /// Decodes samples to f32. An incomplete last sample is ignored.
 pub(super) fn decode(bytes: &[u8], sample: SampleType, order: ByteOrder) -> Vec<f32> {
-    use ByteOrder::{Big, Little};
-    match (sample, order) {
-        (SampleType::Bool, _) => bytes.iter().map(|&b| f32::from(u8::from(b != 0))).collect(),
-        (SampleType::U8, _) => bytes.iter().map(|&b| f32::from(b)).collect(),
-        (SampleType::U16, Little) => each(bytes, |b| f32::from(u16::from_le_bytes(b))),
-        (SampleType::U16, Big) => each(bytes, |b| f32::from(u16::from_be_bytes(b))),
-        (SampleType::I8, _) => each(bytes, |b| f32::from(i8::from_le_bytes(b))),
-        (SampleType::I16, Little) => each(bytes, |b| f32::from(i16::from_le_bytes(b))),
-        (SampleType::I16, Big) => each(bytes, |b| f32::from(i16::from_be_bytes(b))),
-        (SampleType::I32, Little) => each(bytes, |b| i32::from_le_bytes(b) as f32),
-        (SampleType::I32, Big) => each(bytes, |b| i32::from_be_bytes(b) as f32),
-        (SampleType::I64, Little) => each(bytes, |b| i64::from_le_bytes(b) as f32),
-        (SampleType::I64, Big) => each(bytes, |b| i64::from_be_bytes(b) as f32),
-        (SampleType::U32, Little) => each(bytes, |b| u32::from_le_bytes(b) as f32),
-        (SampleType::U32, Big) => each(bytes, |b| u32::from_be_bytes(b) as f32),
-        (SampleType::U64, Little) => each(bytes, |b| u64::from_le_bytes(b) as f32),
-        (SampleType::U64, Big) => each(bytes, |b| u64::from_be_bytes(b) as f32),
-        (SampleType::F16, Little) => each(bytes, |b| f16::from_le_bytes(b).to_f32()),
-        (SampleType::F16, Big) => each(bytes, |b| f16::from_be_bytes(b).to_f32()),
-        (SampleType::F32, Little) => each(bytes, f32::from_le_bytes),
-        (SampleType::F32, Big) => each(bytes, f32::from_be_bytes),
-        (SampleType::F64, Little) => each(bytes, |b| f64::from_le_bytes(b) as f32),
-        (SampleType::F64, Big) => each(bytes, |b| f64::from_be_bytes(b) as f32),
+    macro_rules! numbers {
+        ($type:ty, $convert:expr) => {
+            match order {
+                ByteOrder::Little => each(bytes, |b| $convert(<$type>::from_le_bytes(b))),
+                ByteOrder::Big => each(bytes, |b| $convert(<$type>::from_be_bytes(b))),
+            }
+        };
+    }
+    match sample {
+        SampleType::Bool => bytes.iter().map(|&b| f32::from(u8::from(b != 0))).collect(),
+        SampleType::U8 => bytes.iter().map(|&b| f32::from(b)).collect(),
+        SampleType::I8 => numbers!(i8, f32::from),
+        SampleType::U16 => numbers!(u16, f32::from),
+        SampleType::I16 => numbers!(i16, f32::from),
+        SampleType::U32 => numbers!(u32, |number| number as f32),
+        SampleType::I32 => numbers!(i32, |number| number as f32),
+        SampleType::U64 => numbers!(u64, |number| number as f32),
+        SampleType::I64 => numbers!(i64, |number| number as f32),
+        SampleType::F16 => numbers!(f16, f16::to_f32),
+        SampleType::F32 => numbers!(f32, f32::from),
+        SampleType::F64 => numbers!(f64, |number| number as f32),
     }
 }
 

@@ -169,6 +169,9 @@ pub trait FrameReader {
     fn next_frame(&mut self) -> Result<Option<Array2<f32>>>;
 }
 
+/// A reader of any format.
+pub type Reader = Box<dyn FrameReader + Send>;
+
 /// A stack of frames that a function returns one at a time.
 pub struct Frames<F> {
     info: StackInfo,
@@ -180,6 +183,15 @@ impl<F: FnMut() -> Result<Option<Array2<f32>>>> Frames<F> {
     pub fn new(info: StackInfo, next: F) -> Self {
         Self { info, next }
     }
+}
+
+/// A stack of one frame, which `decode` returns.
+pub(super) fn one_frame(
+    info: StackInfo,
+    decode: impl FnOnce() -> Result<Array2<f32>> + Send + 'static,
+) -> Reader {
+    let mut decode = Some(decode);
+    Box::new(Frames::new(info, move || decode.take().map(|decode| decode()).transpose()))
 }
 
 impl<F: FnMut() -> Result<Option<Array2<f32>>>> FrameReader for Frames<F> {

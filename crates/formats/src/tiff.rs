@@ -15,7 +15,7 @@ use ndarray::Array2;
 
 use super::array::{ArrayReader, RawSamples, Restart};
 use super::axes::Layout;
-use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo, samples};
+use super::{Format, FormatError, FrameReader, Limits, Reader, SampleType, StackInfo, samples};
 use crate::error::Result;
 use directory::Pages;
 use refusal::malformed;
@@ -47,7 +47,7 @@ pub(super) fn open<R: Read + Seek + Send + 'static>(
     mut file: R,
     length: u64,
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let pages = directory::read_pages(&mut file, length, limits)?;
     file.rewind().map_err(FormatError::io("read the TIFF"))?;
     match pages.contiguous {

@@ -219,6 +219,7 @@ mod tests {
     use serde_json::{Value, json};
     use std::collections::BTreeSet;
     use std::path::{Path, PathBuf};
+    use strum::VariantNames;
 
     fn pointers(schedule: Value) -> Vec<String> {
         let schedule: Schedule = serde_json::from_value(schedule).unwrap();
@@ -374,11 +375,11 @@ mod tests {
             "all_static": false, "motion_compensation": true, "outlier_limit": 4.0, "memory": 1.0,
             "static_variance": null, "gamma": null, "momentum": 0.0, "tolerance": 0.0});
         let schema = schemars::schema_for!(Stage).to_value();
-        for prior in PriorName::ALL {
+        for prior in PriorName::VARIANTS {
             let alternatives = schema["oneOf"].as_array().unwrap();
             let own = alternatives
                 .iter()
-                .find(|one| one["properties"]["prior"]["const"] == prior.as_str())
+                .find(|one| one["properties"]["prior"]["const"] == *prior)
                 .unwrap();
             let place = own["$ref"].as_str().unwrap().trim_start_matches('#');
             let parameters = &schema.pointer(place).unwrap()["properties"];
@@ -387,7 +388,7 @@ mod tests {
             };
             let mut fields = every.as_object().unwrap().clone();
             fields.retain(|name, _| known(name));
-            fields.insert("prior".into(), prior.as_str().into());
+            fields.insert("prior".into(), (*prior).into());
             let stage: Stage = serde_json::from_value(fields.clone().into()).unwrap();
             let written = serde_json::to_value(&stage).unwrap();
             let names = |fields: &serde_json::Map<String, Value>| -> BTreeSet<String> {

@@ -184,7 +184,7 @@ fn field_schemas(prior: Option<PriorName>) -> Fields {
     let alternatives = SCHEMA["oneOf"].as_array().into_iter().flatten();
     let possible = alternatives.filter(|alternative| {
         let name = &alternative["properties"]["prior"]["const"];
-        prior.is_none_or(|prior| name == prior.as_str())
+        prior.is_none_or(|prior| name == <&str>::from(prior))
     });
     let parameters = possible.filter_map(|alternative| {
         let place = alternative["$ref"].as_str()?.trim_start_matches('#');

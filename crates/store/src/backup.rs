@@ -24,7 +24,7 @@ use engine::job::{PartialId, Sha256};
 /// writing takes makes another one necessary.
 const ROUNDS: u32 = 50;
 
-#[derive(Debug, Default)]
+#[derive(Debug, Default, serde::Serialize)]
 pub struct Backup {
     /// Files that were copied, the database among them.
     pub files: u64,

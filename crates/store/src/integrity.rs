@@ -23,7 +23,7 @@ const ROUND: Duration = Duration::from_secs(86_400);
 const PAUSE: Duration = Duration::from_secs(10);
 
 /// The result of a comparison of all records with the disk.
-#[derive(Debug, Default)]
+#[derive(Debug, Default, serde::Serialize)]
 pub struct Audit {
     /// Recorded files.
     pub files: u64,

@@ -5,7 +5,6 @@ mod check;
 mod local;
 mod model_check;
 mod model_process;
-#[cfg(feature = "nats")]
 pub mod nats;
 mod perform;
 mod run;

@@ -96,39 +96,40 @@ struct Listed {
 }
 
 impl Wanted {
-    /// True if this selects the file `name` of a snapshot.
-    fn includes(self, name: &str) -> bool {
+    /// The local name of the file, or of the folder.
+    fn name(self) -> String {
+        self.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned())
+    }
+
+    /// For a file that is made from a snapshot on request, its path below the exports of the snapshot.
+    fn snapshot_export(self) -> Option<&'static str> {
         match self {
-            Self::Array => name == "frames.npy",
-            Self::Stack => name == "stack.exr",
-            Self::Mosaic => name == "mosaic.npy",
-            Self::Error => name == "error.npy",
-            Self::Frames => name.starts_with("frames/"),
-            Self::Pictures => name.starts_with("png/"),
-            Self::Manifest => name == "manifest.json",
-            Self::StackWithError
-            | Self::Tiff
-            | Self::Movie
-            | Self::Gif
-            | Self::SequenceArray
-            | Self::SequenceTiff
-            | Self::SequenceMovie
-            | Self::SequenceGif
-            | Self::Archive => false,
+            Self::StackWithError => Some("exr?layers=sigma"),
+            Self::Tiff => Some("tiff"),
+            Self::Movie => Some("mp4"),
+            Self::Gif => Some("gif"),
+            _ => None,
         }
     }
 
-    /// For a file of the whole job, its path below the job's URL and its local name.
-    fn job_file(self) -> Option<(&'static str, &'static str)> {
+    /// For a file of the whole job, its path below the exports of the job.
+    fn job_export(self) -> Option<&'static str> {
         match self {
-            Self::Manifest => Some(("exports/manifest", "manifest.json")),
-            Self::SequenceArray => Some(("exports/npy", "sequence.npy")),
-            Self::SequenceTiff => Some(("exports/tiff", "sequence.tif")),
-            Self::SequenceMovie => Some(("exports/mp4", "sequence.mp4")),
-            Self::SequenceGif => Some(("exports/gif", "sequence.gif")),
-            Self::Archive => Some(("exports/zip", "results.zip")),
+            Self::Manifest => Some("manifest"),
+            Self::SequenceArray => Some("npy"),
+            Self::SequenceTiff => Some("tiff"),
+            Self::SequenceMovie => Some("mp4"),
+            Self::SequenceGif => Some("gif"),
+            Self::Archive => Some("zip"),
             _ => None,
         }
+    }
+
+    /// True if this selects the file `name` in the list of a snapshot. Each snapshot has a manifest, too.
+    fn includes(self, name: &str) -> bool {
+        let is_listed = self == Self::Manifest
+            || (self.snapshot_export().is_none() && self.job_export().is_none());
+        is_listed && name.split('/').next() == Some(&self.name())
     }
 }
 
@@ -194,6 +195,8 @@ impl Client {
         folder: &Path,
     ) -> Result<Vec<PathBuf>> {
         let base = format!("/v1/jobs/{}", job.id);
+        let all = Wanted::value_variants().iter();
+        let wanted: Vec<_> = all.filter(|one| wanted.contains(one)).collect();
         let mut files = Vec::new();
         for snapshot in job.snapshots.indices() {
             let snapshot_url = format!("{base}/snapshots/{snapshot}");
@@ -207,31 +210,17 @@ impl Client {
                     files.push((format!("{base}/snapshots/{href}"), path, Some(file.sha256)));
                 }
             }
-            let exports = [
-                (Wanted::StackWithError, "exr?layers=sigma", "stack-sigma.exr"),
-                (Wanted::Tiff, "tiff", "stack.tif"),
-                (Wanted::Movie, "mp4", "movie.mp4"),
-                (Wanted::Gif, "gif", "movie.gif"),
-            ];
-            for (export, query, name) in exports {
-                if wanted.contains(&export) {
-                    let href = format!("{snapshot_url}/exports/{query}");
-                    files.push((href, snapshot_folder.join(name), None));
-                }
-            }
-            for (movie, format) in [(Wanted::Movie, "mp4"), (Wanted::Gif, "gif")] {
-                if wanted.contains(&movie) {
-                    self.create_movie(&base, Some(snapshot), format).await?;
-                }
+            for wanted in &wanted {
+                let Some(export) = wanted.snapshot_export() else { continue };
+                self.prepare(&base, Some(snapshot), export).await?;
+                let href = format!("{snapshot_url}/exports/{export}");
+                files.push((href, snapshot_folder.join(wanted.name()), None));
             }
         }
-        for (movie, format) in [(Wanted::SequenceMovie, "mp4"), (Wanted::SequenceGif, "gif")] {
-            if wanted.contains(&movie) {
-                self.create_movie(&base, None, format).await?;
-            }
-        }
-        for (query, name) in wanted.iter().filter_map(|wanted| wanted.job_file()) {
-            files.push((format!("{base}/{query}"), folder.join(name), None));
+        for wanted in &wanted {
+            let Some(export) = wanted.job_export() else { continue };
+            self.prepare(&base, None, export).await?;
+            files.push((format!("{base}/exports/{export}"), folder.join(wanted.name()), None));
         }
         for (href, path, sha256) in &files {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -242,9 +231,12 @@ impl Client {
         Ok(files.into_iter().map(|(_, path, _)| path).collect())
     }
 
-    /// Has the service encode a movie of a snapshot of a job, or of all; it may exist already.
-    async fn create_movie(&self, job: &str, snapshot: Option<u32>, format: &str) -> Result<()> {
-        let body = serde_json::json!({"format": format, "snapshot": snapshot});
+    /// Has the service encode an export of a snapshot of a job, or of all, if it is a movie; it may exist already.
+    async fn prepare(&self, job: &str, snapshot: Option<u32>, export: &str) -> Result<()> {
+        if !["mp4", "gif"].contains(&export) {
+            return Ok(());
+        }
+        let body = serde_json::json!({"format": export, "snapshot": snapshot});
         self.post(&format!("{job}/exports"), &body).await.map(|_| ())
     }
 

@@ -19,6 +19,7 @@ use serde_json::Value;
 
 use super::CliError;
 use super::fields::{Role, as_options};
+use engine::job::with_causes;
 
 pub(super) use download::rename_new;
 pub(super) use job::{Job, Wanted};
@@ -278,18 +279,4 @@ fn refused(status: StatusCode, problem: &Value) -> ClientError {
         return ClientError::Temporary(format!("the service answers {status} {code}: {detail}"));
     }
     ClientError::Refused { status, code, detail }
-}
-
-/// The text of an error and its causes.
-fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut source = error.source();
-    while let Some(cause) = source {
-        let cause_text = cause.to_string();
-        if !text.contains(&cause_text) {
-            text += &format!(": {cause_text}");
-        }
-        source = cause.source();
-    }
-    text
 }

@@ -6,20 +6,21 @@ mod service;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use clap::Args;
-use indicatif::MultiProgress;
 use ndarray::{Array3, Axis, concatenate};
 use serde_json::{Value, json};
 use uuid::Uuid;
 
-use super::client::{Client, Wanted};
-use super::{CliError, progress};
+use super::CliError;
+use super::client::{Client, Job, Wanted};
+use super::exec::ExecArguments;
+use super::watch::until_ended;
 use crate::cli::error::Result;
 use crate::cli::output::print_line;
 use engine::intake::sample;
-use engine::job::{Algorithm, JobState};
+use engine::job::Algorithm;
 use formats::{Limits, exr};
 use page::Reconstruction;
 use report::{PAGE, Quality, Report};
@@ -30,8 +31,6 @@ const REPORT: &str = "demo.json";
 /// Names of the files and folders that the demo creates.
 const PARTS: [&str; 6] = ["input", "service", "frames", "service.log", page::PICTURES, PAGE];
 const COMPARED: [Algorithm; 2] = [Algorithm::GapTv, Algorithm::PnpTvFastdvdnet];
-/// Time between requests for the jobs' progress.
-const POLL: Duration = Duration::from_millis(250);
 
 /// Run the service on a simulated snapshot, and compare the results.
 #[derive(Debug, Args)]
@@ -96,7 +95,11 @@ async fn through_http(
         let body = json!({"measurement": measurement, "algorithm": name, "label": "demo"});
         jobs.push((name, create(client, "/v1/jobs", &body).await?));
     }
-    watch(client, &jobs).await?;
+    let named: Vec<_> = jobs.iter().map(|(name, id)| (*name, id.as_str())).collect();
+    let ended = until_ended(client, &named, &ExecArguments::default()).await?;
+    if let Some(reason) = ended.iter().find_map(Job::failure) {
+        return Err(CliError::Failure(reason));
+    }
     let (mut qualities, mut results) = (Vec::new(), Vec::new());
     for (name, job) in &jobs {
         let folder = out.join("frames").join(name);
@@ -135,27 +138,6 @@ async fn cpu_seconds(client: &Client, job: &str) -> Result<f64> {
     let manifest = client.get(&format!("/v1/jobs/{job}/exports/manifest")).await?;
     let seconds = manifest["run"]["cpu_seconds"].as_f64();
     seconds.ok_or_else(|| CliError::Failure("the manifest has no cpu_seconds".into()))
-}
-
-/// Shows the progress of all jobs until they have succeeded.
-async fn watch(client: &Client, jobs: &[(&'static str, String)]) -> Result<()> {
-    let screen = MultiProgress::with_draw_target(progress::target());
-    let bars: Vec<_> = jobs.iter().map(|(name, _)| screen.add(progress::bar(*name))).collect();
-    let mut done = vec![false; jobs.len()];
-    while !done.iter().all(|&done| done) {
-        for (((name, job), bar), done) in jobs.iter().zip(&bars).zip(&mut done) {
-            let job = client.job(job, 0).await?;
-            if let Some(reason) = job.failure() {
-                return Err(CliError::Failure(format!("{name}: {reason}")));
-            }
-            progress::show(bar, job.progress.percent / 100.0);
-            *done = job.state == JobState::Succeeded;
-        }
-        tokio::time::sleep(POLL).await;
-    }
-    // The demo does not depend on the bars. A failure to clear them is ignored.
-    let _ = screen.clear();
-    Ok(())
 }
 
 /// Creates an empty folder, or clears the folder of an earlier demo. Returns the absolute path.

@@ -5,12 +5,12 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
-use serde::Deserialize;
 use tokio::io::{AsyncBufReadExt, BufReader};
 use tokio::process::{Child, Command};
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
+use crate::cli::serve::Announcement;
 
 /// Time that the service has to start, and to stop.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -18,12 +18,6 @@ const PATIENCE: Duration = Duration::from_secs(30);
 /// A running service. It is killed if this is dropped.
 pub(super) struct Service {
     process: Child,
-    url: String,
-}
-
-/// The line that `serve` prints once it listens.
-#[derive(Debug, Deserialize)]
-struct Announcement {
     url: String,
 }
 

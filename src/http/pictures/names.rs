@@ -25,112 +25,31 @@ use formats::mat::SceneArray;
 use formats::{self, Channels, FormatError, Wanted};
 use store::{Calibration, Job, Measurement, StoreError, TileResult};
 
-/// The name of a picture of a job's snapshot.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
-enum JobPicture {
-    /// `frame-N`, from 1.
-    Frame(usize),
-    /// `difference-N`: frame N minus frame N-1, from 2.
-    Difference(usize),
-    /// `residual`: the difference between the measurement and the masked sum of the frames.
-    Residual,
-    /// `error-N`: the expected error of frame N, from 1.
-    Error(usize),
-    /// `deviation-N`: frame N minus its true frame, from 1.
-    Deviation(usize),
-    /// `colours`: all bands of a spectral camera in false colours.
-    Colours,
-    /// `slice-N`: row N of all frames, from 0.
-    Slice(usize),
-}
+/// The pictures of a job's snapshot:
+/// - `frame-N`, from 1.
+/// - `difference-N`: frame N minus frame N-1, from 2.
+/// - `residual`: the difference between the measurement and the masked sum of the frames.
+/// - `error-N`: the expected error of frame N, from 1.
+/// - `deviation-N`: frame N minus its true frame, from 1.
+/// - `colours`: all bands of a spectral camera in false colours.
+/// - `slice-N`: row N of all frames, from 0.
+const OF_JOB: &str =
+    "pictures are frame-N, difference-N, error-N, deviation-N, slice-ROW, colours and residual";
+/// The pictures of an uploaded file: `frame-N`, from 1, and the first frame of an array in a file of several.
+const OF_BLOB: &str = "pictures are frame-N and array-NAME";
+/// The pictures of a measurement, from 0.
+const OF_MEASUREMENT: &str = "pictures are snapshot-N";
+/// The pictures of a calibration: `mask-N`, from 1; `mean`, the mean of all masks; `gram`, the sum of their squares; and
+/// `dead`, 1 at pixels that are dark in all masks, otherwise 0.
+const OF_CALIBRATION: &str = "pictures are mask-N, mean, gram and dead";
 
-/// The name of a picture of an uploaded file.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
-enum BlobPicture {
-    /// `frame-N`, from 1.
-    Frame(usize),
-    /// `array-NAME`: the first frame of an array in a file of several.
-    Array(String),
-}
-
-/// The name of a picture of a measurement: `snapshot-N`, from 0.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
-struct MeasurementPicture(usize);
-
-/// The name of a picture of a calibration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
-enum CalibrationPicture {
-    /// `mask-N`, from 1.
-    Mask(usize),
-    /// `mean`: the mean of all masks.
-    Mean,
-    /// `gram`: the sum of the squares of all masks.
-    Gram,
-    /// `dead`: 1 at pixels that are dark in all masks, otherwise 0.
-    Dead,
-}
-
-/// The number in a text of the form NAME-NUMBER.
-fn numbered(text: &str, name: &str) -> Option<usize> {
-    canonical_number(text.strip_prefix(name)?.strip_prefix('-')?)
-}
-
-impl TryFrom<String> for JobPicture {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        let number = |name| numbered(&text, name);
-        let picture = match text.as_str() {
-            "residual" => Some(Self::Residual),
-            "colours" => Some(Self::Colours),
-            _ => (number("frame").map(Self::Frame))
-                .or_else(|| number("difference").map(Self::Difference))
-                .or_else(|| number("error").map(Self::Error))
-                .or_else(|| number("deviation").map(Self::Deviation))
-                .or_else(|| number("slice").map(Self::Slice)),
-        };
-        let names = "pictures are frame-N, difference-N, error-N, deviation-N, slice-ROW, colours and residual";
-        picture.ok_or_else(|| names.into())
-    }
-}
-
-impl TryFrom<String> for BlobPicture {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        if let Some(name) = text.strip_prefix("array-") {
-            return Ok(Self::Array(name.to_owned()));
-        }
-        let frame = numbered(&text, "frame").map(Self::Frame);
-        frame.ok_or_else(|| "pictures are frame-N and array-NAME".into())
-    }
-}
-
-impl TryFrom<String> for MeasurementPicture {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        numbered(&text, "snapshot").map(Self).ok_or_else(|| "pictures are snapshot-N".into())
-    }
-}
-
-impl TryFrom<String> for CalibrationPicture {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        match text.as_str() {
-            "mean" => Ok(Self::Mean),
-            "gram" => Ok(Self::Gram),
-            "dead" => Ok(Self::Dead),
-            _ => numbered(&text, "mask")
-                .map(Self::Mask)
-                .ok_or_else(|| "pictures are mask-N, mean, gram and dead".into()),
-        }
-    }
+/// Splits a text of the form NAME-NUMBER. Other texts are names without a number.
+fn parts(text: &str) -> (&str, Option<usize>) {
+    let numbered = text.rsplit_once('-').and_then(|(name, number)| {
+        let number = canonical_number(number)?;
+        Some((name, Some(number)))
+    });
+    numbered.unwrap_or((text, None))
 }
 
 /// Parameters of a path that name a picture.
@@ -143,52 +62,61 @@ pub(in crate::http) trait Named: DeserializeOwned + Send {
 pub(in crate::http) struct OfJob {
     job: JobId,
     snapshot: u32,
-    picture: JobPicture,
+    picture: String,
 }
 
 #[derive(Debug, Deserialize)]
 pub(in crate::http) struct OfBlob {
     sha256: Sha256,
-    picture: BlobPicture,
+    picture: String,
 }
 
 #[derive(Debug, Deserialize)]
 pub(in crate::http) struct OfMeasurement {
     measurement: MeasurementId,
-    picture: MeasurementPicture,
+    picture: String,
 }
 
 #[derive(Debug, Deserialize)]
 pub(in crate::http) struct OfCalibration {
     calibration: CalibrationId,
-    picture: CalibrationPicture,
+    picture: String,
 }
 
 impl Named for OfJob {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let Self { job, snapshot, picture } = self;
+        let picture = parts(&picture);
+        if !matches!(
+            picture,
+            ("frame" | "difference" | "error" | "deviation" | "slice", Some(_))
+                | ("colours" | "residual", None)
+        ) {
+            return Err(not_found(OF_JOB.into()));
+        }
         let job = with_snapshot(app, lab, job, snapshot).await?;
         let SceneShape { frames, height, .. } = job.spec.frame_shape();
-        if let JobPicture::Error(k) = picture
-            && (1..=frames).contains(&k)
+        let is_frame = |k: usize| (1..=frames).contains(&k);
+        if let ("error", Some(k)) = picture
+            && is_frame(k)
         {
             return error_picture(app, &job, snapshot, k - 1).await;
         }
         let stack = frames_stack(app, &job, snapshot).await?;
         match picture {
-            JobPicture::Frame(k) if (1..=frames).contains(&k) => Ok(stack.frame(k - 1)),
-            JobPicture::Difference(k) if (2..=frames).contains(&k) => Ok(stack.difference(k - 1)),
-            JobPicture::Slice(row) if row < height => Ok(stack.slice(row)),
-            JobPicture::Deviation(k) if (1..=frames).contains(&k) => {
+            ("frame", Some(k)) if is_frame(k) => Ok(stack.frame(k - 1)),
+            ("difference", Some(k)) if is_frame(k) && k > 1 => Ok(stack.difference(k - 1)),
+            ("slice", Some(row)) if row < height => Ok(stack.slice(row)),
+            ("deviation", Some(k)) if is_frame(k) => {
                 Ok(stack.deviation(k - 1, true_frame(app, &job, snapshot, k - 1).await?))
             }
-            JobPicture::Colours => stack.false_colours().ok_or_else(|| {
+            ("colours", None) => stack.false_colours().ok_or_else(|| {
                 not_found(
                     "only the bands of a spectral camera with known wavelengths have false colours"
                         .into(),
                 )
             }),
-            JobPicture::Residual => {
+            ("residual", None) => {
                 let masks = app.store.calibration(lab, job.spec.calibration).await?;
                 let masks = masks_stack(app, &masks).await?;
                 let measurement = app.store.measurement(lab, job.spec.measurement).await?;
@@ -206,13 +134,14 @@ impl Named for OfJob {
 impl Named for OfBlob {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let Self { sha256, picture } = self;
+        let (frame, name) = match (picture.strip_prefix("array-"), parts(&picture)) {
+            (Some(name), _) => (1, Some(name.to_owned())),
+            (None, ("frame", Some(frame))) => (frame, None),
+            _ => return Err(not_found(OF_BLOB.into())),
+        };
         app.store.upload(lab, sha256).await?;
         let path = intake::upload(app, sha256).await?;
         let limits = app.limits;
-        let (frame, name) = match picture {
-            BlobPicture::Frame(frame) => (frame, None),
-            BlobPicture::Array(name) => (1, Some(name)),
-        };
         let identity = format!("{sha256} sent {frame} {}", name.as_deref().unwrap_or_default());
         let open = move || match &name {
             None => formats::open_shown(&path, &limits),
@@ -238,9 +167,12 @@ impl Named for OfBlob {
 
 impl Named for OfMeasurement {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
+        let ("snapshot", Some(snapshot)) = parts(&self.picture) else {
+            return Err(not_found(OF_MEASUREMENT.into()));
+        };
         let measurement = app.store.measurement(lab, self.measurement).await?;
         let stack = snapshots_stack(app, &measurement).await?;
-        let (MeasurementPicture(snapshot), count) = (self.picture, stack.shape.0);
+        let count = stack.shape.0;
         if snapshot < count {
             return Ok(stack.frame(snapshot));
         }
@@ -250,17 +182,19 @@ impl Named for OfMeasurement {
 
 impl Named for OfCalibration {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
+        let picture = parts(&self.picture);
+        if !matches!(picture, ("mask", Some(_)) | ("mean" | "gram" | "dead", None)) {
+            return Err(not_found(OF_CALIBRATION.into()));
+        }
         let calibration = app.store.calibration(lab, self.calibration).await?;
         let stack = masks_stack(app, &calibration).await?;
         let count = stack.shape.0;
-        match self.picture {
-            CalibrationPicture::Mask(k) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
-            CalibrationPicture::Mask(_) => {
-                Err(not_found(format!("masks are counted from 1 to {count}")))
-            }
-            CalibrationPicture::Mean => Ok(stack.mean()),
-            CalibrationPicture::Gram => Ok(stack.gram()),
-            CalibrationPicture::Dead => Ok(stack.dead()),
+        match picture {
+            ("mean", _) => Ok(stack.mean()),
+            ("gram", _) => Ok(stack.gram()),
+            ("dead", _) => Ok(stack.dead()),
+            (_, Some(k)) if (1..=count).contains(&k) => Ok(stack.frame(k - 1)),
+            _ => Err(not_found(format!("masks are counted from 1 to {count}"))),
         }
     }
 }
@@ -383,29 +317,18 @@ async fn error_picture(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<
 
 #[cfg(test)]
 mod tests {
-    use super::{CalibrationPicture, JobPicture, MeasurementPicture};
+    use super::parts;
 
     #[test]
     fn every_picture_has_one_name() {
-        let job = |text: &str| JobPicture::try_from(text.to_owned());
-        assert_eq!(job("frame-12"), Ok(JobPicture::Frame(12)));
-        assert_eq!(job("difference-2"), Ok(JobPicture::Difference(2)));
-        assert_eq!(job("slice-0"), Ok(JobPicture::Slice(0)));
-        assert_eq!(job("residual"), Ok(JobPicture::Residual));
-        assert_eq!(job("error-3"), Ok(JobPicture::Error(3)));
-        assert_eq!(job("deviation-3"), Ok(JobPicture::Deviation(3)));
-        assert_eq!(job("colours"), Ok(JobPicture::Colours));
-        for bad in ["frame-01", "frame-+1", "frame", "frame-", "../x", "residual-1", "slice--1", ""]
-        {
-            assert!(job(bad).is_err(), "{bad}");
-        }
+        assert_eq!(parts("frame-12"), ("frame", Some(12)));
+        assert_eq!(parts("slice-0"), ("slice", Some(0)));
+        assert_eq!(parts("residual"), ("residual", None));
         let long = "frame-99999999999999999999999";
-        assert!(job(long).is_err());
-        assert!(MeasurementPicture::try_from("snapshot-3".to_owned()).is_ok());
-        assert_eq!(
-            CalibrationPicture::try_from("mask-1".to_owned()),
-            Ok(CalibrationPicture::Mask(1))
-        );
-        assert!(CalibrationPicture::try_from("masks".to_owned()).is_err());
+        for bad in ["frame-01", "frame-+1", "frame", "frame-", "../x", "slice--1", "", long] {
+            let (name, number) = parts(bad);
+            assert!(number.is_none() || name.ends_with('-'), "{bad}");
+            assert!(!matches!((name, number), ("frame" | "slice", Some(_))), "{bad}");
+        }
     }
 }

@@ -11,7 +11,7 @@ use axum::extract::{OriginalUri, Request, State};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::access::Access;
 use super::app::App;
@@ -20,7 +20,7 @@ use super::context::RequestContext;
 use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, request_key};
 use super::listen::Cut;
-use super::page::{Cursor, Limit, PageBody};
+use super::page::{Cursor, PageBody, PageQuery};
 use engine::job::{Lab, PartialId, Sha256, Timestamp};
 use store::{FIRST_RESERVE, FoundPartial, Made, NewPartial, Partial, PartialFile};
 
@@ -73,14 +73,6 @@ pub(super) async fn version(request: Request, next: Next) -> Response {
     response
 }
 
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct ListQuery {
-    #[serde(default)]
-    limit: Limit,
-    cursor: Option<Cursor<PartialId>>,
-}
-
 #[derive(Debug, Serialize, schemars::JsonSchema)]
 #[schemars(rename = "Upload")]
 pub(super) struct UploadBody {
@@ -116,7 +108,7 @@ async fn current(app: &App, lab: &Lab, id: PartialId) -> Result<UploadBody> {
 /// `GET /v1/uploads`: the lab's uploads, newest first.
 pub(super) async fn list(
     Caller(app, access): Caller,
-    QueryOf(query): QueryOf<ListQuery>,
+    QueryOf(query): QueryOf<PageQuery<PartialId>>,
     request: RequestContext,
 ) -> Result<Response> {
     let after = query.cursor.map(|Cursor(id)| id);
@@ -242,7 +234,7 @@ pub(super) async fn patch(
     request: RequestContext,
     body: Body,
 ) -> Result<Response> {
-    drop(request.precondition((&app.changes, &access.lab), current(&app, &access.lab, id)).await?);
+    drop(request.precondition(&app, &access.lab, current(&app, &access.lab, id)).await?);
     let permit = app.admission.place(&access.lab)?;
     let upload = run_detached(async move {
         let _permit = permit;
@@ -348,8 +340,7 @@ pub(super) async fn delete(
     Params(id): Params<PartialId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition((&app.changes, &access.lab), current(&app, &access.lab, id)).await?;
+    let _guard = request.precondition(&app, &access.lab, current(&app, &access.lab, id)).await?;
     app.store.partial(&access.lab, id).await?;
     let store = app.store.clone();
     let deleted = run_detached(async move { Ok(store.delete_partial(id).await?) });

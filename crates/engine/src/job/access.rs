@@ -9,7 +9,7 @@ use rand::rngs::{SysError, SysRng};
 use serde::Serialize;
 use strum::{Display, EnumString, IntoStaticStr, VariantArray};
 
-use super::text::{InvalidText, Sha256};
+use super::text::{InvalidText, Sha256, plain_name};
 
 /// A lab (tenant). Data belong to one lab and are invisible to all others.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, derive_more::Display, schemars::JsonSchema)]
@@ -32,13 +32,7 @@ impl FromStr for Lab {
     type Err = InvalidText;
 
     fn from_str(text: &str) -> Result<Self, InvalidText> {
-        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
-        if (1..=40).contains(&text.len()) && text.chars().all(plain) {
-            return Ok(Self(text.into()));
-        }
-        Err(InvalidText::new(format!(
-            "{text:?} is not a valid lab name: use 1 to 40 characters of a-z, 0-9 and -"
-        )))
+        plain_name(text, "lab", 40).map(Self)
     }
 }
 

@@ -5,7 +5,7 @@ use std::str::FromStr;
 use derive_more::Display;
 use serde_with::{DeserializeFromStr, SerializeDisplay};
 
-use super::text::InvalidText;
+use super::text::{InvalidText, plain_name};
 
 /// The name of a worker pool. All workers of a pool have the same rights and receive the same kind of tiles.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -27,15 +27,7 @@ impl FromStr for Pool {
     type Err = InvalidText;
 
     fn from_str(text: &str) -> Result<Self, InvalidText> {
-        let is_good = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
-        if (1..=Self::MAX_LENGTH).contains(&text.len()) && text.bytes().all(is_good) {
-            return Ok(Self(text.to_owned()));
-        }
-        Err(InvalidText::new(format!(
-            "{:?} is not a valid pool name: use 1 to {} characters of a-z, 0-9 and -",
-            text.chars().take(60).collect::<String>(),
-            Self::MAX_LENGTH
-        )))
+        plain_name(text, "pool", Self::MAX_LENGTH).map(Self)
     }
 }
 

@@ -32,13 +32,15 @@ const SNAPSHOT_BYTES: u64 = 1 << 20;
 
 /// The snapshots of a request: `"all"`, one index, or `[first, last]` with both ends included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(try_from = "SelectionJson", into = "SelectionJson")]
+#[serde(rename_all = "snake_case", try_from = "SelectionJson")]
 pub enum SnapshotSelection {
     #[default]
     All,
     /// The snapshot with this index, counted from 0.
+    #[serde(untagged)]
     One(u32),
     /// From the first to the last index, both included.
+    #[serde(untagged)]
     Range(u32, u32),
 }
 
@@ -55,7 +57,7 @@ text_schema!(SnapshotSelection, "Selection", {
     ],
 });
 
-#[derive(Serialize, Deserialize)]
+#[derive(Deserialize)]
 #[serde(
     untagged,
     expecting = "snapshots must be \"all\", one index, or [first, last] with both ends included"
@@ -77,16 +79,6 @@ impl TryFrom<SelectionJson> for SnapshotSelection {
             ),
             SelectionJson::One(index) => Ok(Self::One(index)),
             SelectionJson::Range([first, last]) => Ok(Self::Range(first, last)),
-        }
-    }
-}
-
-impl From<SnapshotSelection> for SelectionJson {
-    fn from(selection: SnapshotSelection) -> Self {
-        match selection {
-            SnapshotSelection::All => Self::Word("all".into()),
-            SnapshotSelection::One(index) => Self::One(index),
-            SnapshotSelection::Range(first, last) => Self::Range([first, last]),
         }
     }
 }

@@ -39,6 +39,18 @@ impl InvalidText {
     }
 }
 
+/// Checks the name of a `kind` of thing: a plain word, so that it needs no escapes anywhere.
+pub(super) fn plain_name(text: &str, kind: &str, longest: usize) -> Result<String, InvalidText> {
+    let is_good = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
+    if (1..=longest).contains(&text.len()) && text.bytes().all(is_good) {
+        return Ok(text.to_owned());
+    }
+    let start: String = text.chars().take(60).collect();
+    Err(InvalidText(format!(
+        "{start:?} is not a valid {kind} name: use 1 to {longest} characters of a-z, 0-9 and -"
+    )))
+}
+
 /// A violation in a request, and its place.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, schemars::JsonSchema)]
 pub struct InvalidField {
@@ -247,6 +259,18 @@ impl fmt::Display for Timestamp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:.3}", self.to_jiff())
     }
+}
+
+/// The text of an error and its causes.
+pub fn with_causes(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    for cause in std::iter::successors(error.source(), |cause| cause.source()) {
+        let cause = cause.to_string();
+        if !text.contains(&cause) {
+            text += &format!(": {cause}");
+        }
+    }
+    text
 }
 
 /// Replaces each absolute path in a text by its last component. Error messages stay useful, and do not reveal the

@@ -208,33 +208,27 @@ pub fn expected(
 /// True if a finding says that the scale of the masks, the dark, or the masks themselves may be wrong. The quality model
 /// knows only results with the right ones.
 fn is_in_doubt(findings: &[Finding]) -> bool {
-    use FindingCode::{
-        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
-        InvertedMasks, MaskScale, MaskValues, MisplacedMasks, MissingMask, MissingPattern, Mosaic,
-        Negative, NegativeOffset, NoDark, ResampledMasks, ShiftedMasks, TurnedMasks,
-        UnexplainedPixels, WrongDark,
-    };
     const DOUBTS: [FindingCode; 20] = [
-        BadCalibration,
-        BinaryMeasurement,
-        DriftedMasks,
-        ExchangedMasks,
-        ForeignMasks,
-        InvertedMasks,
-        MaskScale,
-        MaskValues,
-        MisplacedMasks,
-        MissingMask,
-        MissingPattern,
-        Mosaic,
-        Negative,
-        NegativeOffset,
-        NoDark,
-        ResampledMasks,
-        ShiftedMasks,
-        TurnedMasks,
-        UnexplainedPixels,
-        WrongDark,
+        FindingCode::BadCalibration,
+        FindingCode::BinaryMeasurement,
+        FindingCode::DriftedMasks,
+        FindingCode::ExchangedMasks,
+        FindingCode::ForeignMasks,
+        FindingCode::InvertedMasks,
+        FindingCode::MaskScale,
+        FindingCode::MaskValues,
+        FindingCode::MisplacedMasks,
+        FindingCode::MissingMask,
+        FindingCode::MissingPattern,
+        FindingCode::Mosaic,
+        FindingCode::Negative,
+        FindingCode::NegativeOffset,
+        FindingCode::NoDark,
+        FindingCode::ResampledMasks,
+        FindingCode::ShiftedMasks,
+        FindingCode::TurnedMasks,
+        FindingCode::UnexplainedPixels,
+        FindingCode::WrongDark,
     ];
     // The quality model does not count pixels that were not measured.
     let lacks_pixels = |finding: &Finding| {

@@ -1,7 +1,7 @@
 //! The outer structure of a level 5 file: a header, followed by plain or compressed elements.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Take};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 
 use flate2::bufread::ZlibDecoder;
 
@@ -88,42 +88,45 @@ impl Elements {
     }
 
     /// Borrows the content of an element, to read its header.
-    pub(super) fn content(&mut self, element: Element) -> Result<Content<&mut BufReader<File>>> {
+    pub(super) fn content(&mut self, element: Element) -> Result<Content<'_>> {
         Content::open(&mut self.file, element, self.order)
     }
 
     /// Converts into the content of an element.
-    pub(super) fn into_content(self, element: Element) -> Result<Content<BufReader<File>>> {
+    pub(super) fn into_content(self, element: Element) -> Result<Content<'static>> {
         Content::open(self.file, element, self.order)
     }
 }
 
 /// The decompressed bytes of one array, at most as many as it declares.
-pub(super) struct Content<R> {
-    source: Source<R>,
+pub(super) struct Content<'a> {
+    source: Box<dyn Read + Send + 'a>,
     order: ByteOrder,
     /// Length of the element in the file, in bytes.
     stored: u64,
+    /// Largest number of bytes per stored byte.
+    expansion: u64,
     /// Number of bytes of the array that remain to be read.
     remaining: u64,
 }
 
-enum Source<R> {
-    Plain(Take<R>),
-    Zlib(ZlibDecoder<Take<R>>),
-}
-
-impl<R: BufRead + Seek> Content<R> {
+impl<'a> Content<'a> {
     /// Seeks to an element, and opens its content.
-    pub(super) fn open(mut file: R, element: Element, order: ByteOrder) -> Result<Self> {
+    pub(super) fn open(
+        mut file: impl BufRead + Seek + Send + 'a,
+        element: Element,
+        order: ByteOrder,
+    ) -> Result<Self> {
         file.seek(SeekFrom::Start(element.start)).map_err(read_error)?;
         let stored = element.bytes;
         let bytes = file.take(stored);
         if !element.compressed {
-            return Ok(Self { source: Source::Plain(bytes), order, stored, remaining: stored });
+            let source = Box::new(bytes);
+            return Ok(Self { source, order, stored, expansion: 1, remaining: stored });
         }
-        let source = Source::Zlib(ZlibDecoder::new(bytes));
-        let mut content = Self { source, order, stored, remaining: TAG_BYTES };
+        let source = Box::new(ZlibDecoder::new(bytes));
+        let (expansion, remaining) = (MAX_EXPANSION, TAG_BYTES);
+        let mut content = Self { source, order, stored, expansion, remaining };
         let (kind, bytes) = content.tag()?;
         if kind != MATRIX {
             return Err(malformed(format!(
@@ -133,9 +136,7 @@ impl<R: BufRead + Seek> Content<R> {
         content.remaining = bytes.into();
         Ok(content)
     }
-}
 
-impl<R: BufRead> Content<R> {
     /// Byte order of the file.
     pub(super) fn order(&self) -> ByteOrder {
         self.order
@@ -148,11 +149,7 @@ impl<R: BufRead> Content<R> {
 
     /// Checks that `bytes` more bytes can follow, before memory is allocated for them.
     pub(super) fn check_can_hold(&self, name: &str, bytes: u64) -> Result<()> {
-        let expansion = match self.source {
-            Source::Plain(_) => 1,
-            Source::Zlib(_) => MAX_EXPANSION,
-        };
-        if bytes > self.remaining || bytes > self.stored.saturating_mul(expansion) {
+        if bytes > self.remaining || bytes > self.stored.saturating_mul(self.expansion) {
             return Err(FormatError::Truncated {
                 format: Format::Mat,
                 promised: format!("'{name}' with {bytes} bytes of samples"),
@@ -188,15 +185,6 @@ impl<R: BufRead> Content<R> {
             return Err(malformed("an array has more bytes than its size states"));
         }
         Ok(())
-    }
-}
-
-impl<R: BufRead> Read for Source<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        match self {
-            Self::Plain(source) => source.read(buffer),
-            Self::Zlib(source) => source.read(buffer),
-        }
     }
 }
 

@@ -1,7 +1,5 @@
 //! The inner structure of an array: flags, dimensions, name, samples.
 
-use std::io::BufRead;
-
 use super::element::{Content, malformed};
 use crate::error::Result;
 use crate::hdf5::python_name;
@@ -34,7 +32,7 @@ pub(super) struct ArrayHeader {
 
 impl ArrayHeader {
     /// Reads the header. Empty arrays and those of opaque classes have no header, and so no name.
-    pub(super) fn read<R: BufRead>(content: &mut Content<R>) -> Result<Self> {
+    pub(super) fn read(content: &mut Content<'_>) -> Result<Self> {
         let mut header = Self { name: String::new(), dimensions: Vec::new(), class: 0, flags: 0 };
         if content.is_empty() {
             return Ok(header);
@@ -106,8 +104,8 @@ impl ArrayHeader {
 }
 
 /// Reads the tag of the samples: their storage type and number of bytes, which must match the dimensions.
-pub(super) fn read_data_tag<R: BufRead>(
-    content: &mut Content<R>,
+pub(super) fn read_data_tag(
+    content: &mut Content<'_>,
     header: &ArrayHeader,
 ) -> Result<(SampleType, u64)> {
     let (kind, bytes) = content.tag()?;
@@ -141,7 +139,7 @@ struct Part {
 
 impl Part {
     /// Reads a part of at most `limit` bytes, and its padding.
-    fn read<R: BufRead>(content: &mut Content<R>, name: &'static str, limit: u32) -> Result<Self> {
+    fn read(content: &mut Content<'_>, name: &'static str, limit: u32) -> Result<Self> {
         let (kind, size) = content.tag()?;
         if kind > 0xffff {
             // At most four bytes are packed into the tag, in the place of the size.

@@ -22,7 +22,7 @@ use super::hdf5::python_name;
 use super::samples::{self, ByteOrder};
 pub use super::scene::SceneArray;
 use super::scene::list;
-use super::{Format, FormatError, FrameReader, Limits, SampleType, StackInfo};
+use super::{Format, FormatError, Limits, Reader, SampleType, StackInfo};
 use crate::error::Result;
 
 /// The names of the arrays of numbers. Errors: damaged files.
@@ -45,7 +45,7 @@ pub(super) fn open(
     length: u64,
     (array, name, expected): (SceneArray, &str, &Expected),
     limits: &Limits,
-) -> Result<Box<dyn FrameReader + Send>> {
+) -> Result<Reader> {
     let again = file.try_clone().map_err(FormatError::io("open the file"))?;
     let mut elements = Elements::new(BufReader::new(file), length)?;
     let mut present = Vec::new();
@@ -68,7 +68,7 @@ pub(super) fn open(
 
 /// The samples of one array.
 struct MatSamples {
-    content: Content<BufReader<File>>,
+    content: Content<'static>,
     /// Another handle to the file, for further passes.
     file: File,
     element: Element,
@@ -78,7 +78,7 @@ struct MatSamples {
 
 impl MatSamples {
     fn new(
-        (mut content, file): (Content<BufReader<File>>, File),
+        (mut content, file): (Content<'static>, File),
         (element, order): (Element, ByteOrder),
         (scene, expected): (Option<SceneArray>, &Expected),
         limits: &Limits,

@@ -1,10 +1,10 @@
 //! All priors, with their names in JSON.
 
-use std::fmt;
 use std::ops::Deref;
 
 use schemars::JsonSchema;
 use serde::Serialize;
+use strum::{Display, EnumString, IntoStaticStr, VariantNames};
 
 use super::Spec;
 use super::network::{FastdvdnetInt8Spec, FastdvdnetSpec, FfdnetSpec};
@@ -25,20 +25,9 @@ macro_rules! priors {
 
         /// The name of a prior.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        #[derive(Display, EnumString, IntoStaticStr, VariantNames)]
         pub enum PriorName {
-            $($(#[$doc])+ $variant,)+
-        }
-
-        impl PriorName {
-            /// All priors.
-            pub const ALL: &[Self] = &[$(Self::$variant,)+];
-
-            /// The name in JSON.
-            pub const fn as_str(self) -> &'static str {
-                match self {
-                    $(Self::$variant => $name,)+
-                }
-            }
+            $($(#[$doc])+ #[strum(serialize = $name)] $variant,)+
         }
 
         impl PriorSpec {
@@ -133,15 +122,9 @@ impl PriorName {
     /// # Errors
     /// A message that lists the names.
     pub(crate) fn parse(name: &str) -> Result<Self, String> {
-        Self::ALL.iter().copied().find(|prior| prior.as_str() == name).ok_or_else(|| {
-            let names: Vec<_> = Self::ALL.iter().map(|prior| prior.as_str()).collect();
-            format!("unknown variant `{name}`, expected one of `{}`", names.join("`, `"))
+        name.parse().map_err(|_| {
+            let names = Self::VARIANTS.join("`, `");
+            format!("unknown variant `{name}`, expected one of `{names}`")
         })
-    }
-}
-
-impl fmt::Display for PriorName {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
     }
 }

@@ -9,12 +9,11 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use sqlx::SqliteConnection;
-use sqlx::sqlite::SqliteRow;
 
 use super::claim::ClaimedTask;
 use super::lease::{self, Heartbeat, Lease, Loss};
 use crate::Store;
-use crate::columns::{Columns, FromRow, sql, sql_as};
+use crate::columns::{Columns, from_row, sql, sql_as};
 use crate::error::StoreError;
 use crate::tables::{tasks, workers};
 use engine::job::{
@@ -96,26 +95,21 @@ macro_rules! rows {
     };
 }
 
-impl FromRow for RemoteTask {
-    fn from_row(row: &SqliteRow) -> Result<Self, StoreError> {
-        let place = (row.read("stream")?, row.read("seq")?);
-        Ok(Self {
-            task: row.read("task")?,
-            job: row.read("job")?,
-            pool: row.read("pool")?,
-            attempt: row.read("attempt")?,
-            message: row.read("message")?,
-            place: match place {
-                (Some(stream), Some(seq)) => Some(MessagePlace { stream, seq }),
-                _ => None,
-            },
-            delivery: row.read("delivery")?,
-            worker: row.read("worker")?,
-            started_at: row.read("started_at")?,
-            wanted: is_wanted(row.read("job_state")?),
-        })
-    }
-}
+from_row!(RemoteTask, row => {
+    task,
+    job,
+    pool,
+    attempt,
+    message,
+    place = match (row.read("stream")?, row.read("seq")?) {
+        (Some(stream), Some(seq)) => Some(MessagePlace { stream, seq }),
+        _ => None,
+    },
+    delivery,
+    worker,
+    started_at,
+    wanted = is_wanted(row.read("job_state")?),
+});
 
 impl Store {
     /// The tiles that are out.

@@ -4,10 +4,9 @@ use std::time::Duration;
 
 use serde::Serialize;
 use sqlx::SqliteConnection;
-use sqlx::sqlite::SqliteRow;
 
 use crate::Store;
-use crate::columns::{Columns, FromRow, from_row, sql, sql_as};
+use crate::columns::{from_row, sql, sql_as};
 use crate::error::Result;
 use engine::job::{CalibrationId, JobId, Timestamp, WorkerId};
 
@@ -24,6 +23,19 @@ pub struct WorkerRow {
     /// The running task.
     pub task: Option<WorkerTask>,
 }
+
+from_row!(WorkerRow, row => {
+    id,
+    pid,
+    version,
+    place = WorkerPlace::from_row(row)?,
+    started_at,
+    seen_at,
+    task = match row.read::<Option<String>>("kind")? {
+        Some(_) => Some(WorkerTask::from_row(row)?),
+        None => None,
+    },
+});
 
 /// The claimant of a task, which decides what it may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -107,7 +119,7 @@ impl Store {
 
     /// The workers that gave a sign of life within `age`, except the light one: it adds nothing to the speed of jobs.
     pub async fn live_workers(&self, age: Duration) -> Result<Vec<WorkerRow>> {
-        let rows = sql!(
+        sql_as!(
             "SELECT workers.id, pid, version, host, pool, device, started_at, seen_at,
                  coalesce(job, (SELECT id FROM jobs WHERE id = thing)) AS job,
                  (SELECT id FROM requests WHERE id = thing AND what = 'calibration') AS calibration,
@@ -117,8 +129,7 @@ impl Store {
             [since(age)]
         )
         .fetch_all(&self.readers)
-        .await?;
-        rows.iter().map(worker).collect()
+        .await
     }
 
     /// Number of workers that take tiles and gave a sign of life within `age`.
@@ -174,17 +185,4 @@ pub async fn seen(connection: &mut SqliteConnection, id: WorkerId) -> Result<()>
 
 fn since(age: Duration) -> i64 {
     Timestamp::now().0 - i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2)
-}
-
-fn worker(row: &SqliteRow) -> Result<WorkerRow> {
-    let has_task = row.read::<Option<String>>("kind")?.is_some();
-    Ok(WorkerRow {
-        id: row.read("id")?,
-        pid: row.read("pid")?,
-        version: row.read("version")?,
-        place: WorkerPlace::from_row(row)?,
-        started_at: row.read("started_at")?,
-        seen_at: row.read("seen_at")?,
-        task: has_task.then(|| WorkerTask::from_row(row)).transpose()?,
-    })
 }

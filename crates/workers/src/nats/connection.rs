@@ -13,7 +13,7 @@ use async_nats::{Client, ClientError, ConnectErrorKind, ConnectOptions, Event, S
 use serde::Serialize;
 use tempfile::NamedTempFile;
 
-use engine::job::Pool;
+use engine::job::{Pool, with_causes};
 
 /// Timeout of requests to the server.
 const ANSWER: Duration = Duration::from_secs(5);
@@ -184,16 +184,7 @@ impl Access {
             if error.kind() == ConnectErrorKind::AuthorizationViolation {
                 return ClusterError::Unauthorized { url: url.clone() };
             }
-            let mut reason = error.to_string();
-            let mut source = std::error::Error::source(&error);
-            while let Some(error) = source {
-                let text = error.to_string();
-                if !reason.contains(&text) {
-                    reason += &format!(": {text}");
-                }
-                source = error.source();
-            }
-            ClusterError::Unreachable { url: url.clone(), reason }
+            ClusterError::Unreachable { url: url.clone(), reason: with_causes(&error) }
         })?;
         let context =
             ContextBuilder::new().timeout(ANSWER).ack_timeout(ANSWER).build(client.clone());

@@ -479,14 +479,10 @@ impl Remote {
         let id = format!("{}.{}.{}", event.task, event.attempt, event.worker);
         self.persist(|| async {
             let message = PublishMessage::build().message_id(&id).payload(text.clone().into());
-            let message = message.outbound_message(names::event(&self.0.pool));
+            let failed = ClusterError::nats("report the end of a tile");
             let context = &self.0.connection.context;
-            let headers = message.headers.unwrap_or_default();
-            let sent =
-                context.publish_with_headers(message.subject, headers, message.payload).await;
-            sent.map_err(ClusterError::nats("report the end of a tile"))?
-                .await
-                .map_err(ClusterError::nats("report the end of a tile"))
+            let sent = context.send_publish(names::event(&self.0.pool), message).await;
+            sent.map_err(&failed)?.await.map_err(&failed)
         })
         .await?;
         Ok(())

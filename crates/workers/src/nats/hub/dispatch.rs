@@ -113,18 +113,9 @@ impl Core {
         let text = serde_json::to_vec(&message).map_err(PipelineError::record("tile"))?;
         let id = format!("{}.{}", lease.task, lease.attempt);
         let message = PublishMessage::build().message_id(id).payload(text.into());
-        let message = message.outbound_message(names::task(pool));
         let failed = ClusterError::nats("publish a tile");
-        let sent = self
-            .connection
-            .context
-            .publish_with_headers(
-                message.subject,
-                message.headers.unwrap_or_default(),
-                message.payload,
-            )
-            .await;
-        let stored = sent.map_err(&failed)?.await.map_err(ClusterError::nats("publish a tile"))?;
+        let sent = self.connection.context.send_publish(names::task(pool), message).await;
+        let stored = sent.map_err(&failed)?.await.map_err(&failed)?;
         let stream = lock(&self.stream).clone();
         let place = MessagePlace { stream, seq: stored.sequence.cast_signed() };
         self.store.remote_published(&lease, &place).await?;
