@@ -27,7 +27,8 @@ pub struct Arguments {
     #[arg(value_name = "FILE", required_unless_present = "manifest")]
     files: Vec<PathBuf>,
     /// The manifest of a job, which is repeated with the same calibration, measurement and settings.
-    #[arg(long, value_name = "FILE", group = "camera", conflicts_with_all = SETTINGS)]
+    #[arg(long, value_name = "FILE", group = "camera",
+          conflicts_with_all = SETTINGS)]
     manifest: Option<PathBuf>,
     #[command(flatten)]
     service: ServiceArguments,
