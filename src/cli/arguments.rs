@@ -6,10 +6,11 @@ use std::str::FromStr;
 
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+use serde::de::DeserializeOwned;
 
 use super::CliError;
 use super::confine::{confine_network, folders_of, limit_memory};
-use crate::cli::error::Result;
+use crate::cli::error::{Result, read_json};
 use crate::config::device;
 use engine::job::{
     Algorithm, Dispersion, DispersionAxis, InvalidField, MaskExtent, RegistrationRequest,
@@ -21,18 +22,32 @@ use reconstruction::priors::onnx::Device;
 use reconstruction::registration::Similarity;
 use reconstruction::schedule::Schedule;
 use serde_json::{Value, json};
-use strum::{VariantArray, VariantNames};
+use strum::VariantNames;
 
-/// Algorithm and schedule.
+/// The algorithm and the file of its schedule.
 #[derive(Debug, Args)]
-pub(super) struct ScheduleArguments {
+pub(super) struct AlgorithmArguments {
     /// The algorithm.
     #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
-          value_parser = named_all())]
+          value_parser = named::<Algorithm>())]
     pub(super) algorithm: Algorithm,
     /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's default.
     #[arg(long, value_name = "FILE")]
     schedule: Option<PathBuf>,
+}
+
+impl AlgorithmArguments {
+    /// Reads the file of the schedule, if there is one.
+    pub(super) fn schedule<T: DeserializeOwned>(&self) -> Result<Option<T>> {
+        self.schedule.as_deref().map(|path| read_json("schedule", path)).transpose()
+    }
+}
+
+/// Algorithm, schedule and iterations.
+#[derive(Debug, Args)]
+pub(super) struct ScheduleArguments {
+    #[command(flatten)]
+    stated: AlgorithmArguments,
     /// Run exactly N iterations without a test for convergence; the last stage is shortened or extended.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     iterations: Option<u32>,
@@ -167,25 +182,21 @@ pub struct NetworkArguments {
 }
 
 impl ScheduleArguments {
+    pub(super) fn algorithm(&self) -> Algorithm {
+        self.stated.algorithm
+    }
+
     /// Reads and checks the schedule. It has no stages for `learned`.
     pub(super) fn resolve(&self) -> Result<Schedule> {
-        if self.algorithm == Algorithm::Learned {
-            if self.schedule.is_some() || self.iterations.is_some() {
+        if self.algorithm() == Algorithm::Learned {
+            if self.stated.schedule.is_some() || self.iterations.is_some() {
                 let text = "learned runs one network once: it takes no --schedule or --iterations";
                 return Err(CliError::Input(text.into()));
             }
-            return Ok(self.algorithm.default_schedule());
+            return Ok(self.algorithm().default_schedule());
         }
-        let schedule: Schedule = match &self.schedule {
-            None => self.algorithm.default_schedule(),
-            Some(path) => {
-                let refused = |error: &dyn std::fmt::Display| {
-                    CliError::Input(format!("schedule {}: {error}", path.display()))
-                };
-                let text = fs::read_to_string(path).map_err(|error| refused(&error))?;
-                serde_json::from_str(&text).map_err(|error| refused(&error))?
-            }
-        };
+        let schedule: Option<Schedule> = self.stated.schedule()?;
+        let schedule = schedule.unwrap_or_else(|| self.algorithm().default_schedule());
         let faults = InvalidField::schedule_errors(&schedule);
         if !faults.is_empty() {
             let line = |fault: InvalidField| format!("{}: {}", fault.pointer, fault.detail);
@@ -193,7 +204,7 @@ impl ScheduleArguments {
             let text = format!("the schedule can't be used: {}", lines.join("; "));
             return Err(CliError::Input(text));
         }
-        if let Some(misfit) = self.algorithm.misfit(&schedule) {
+        if let Some(misfit) = self.algorithm().misfit(&schedule) {
             return Err(CliError::Input(format!("the schedule does not fit: {misfit}")));
         }
         Ok(match self.iterations {
@@ -300,7 +311,8 @@ impl NetworkArguments {
 
 /// Parses names of algorithms that need no network of the user.
 pub fn algorithms() -> impl TypedValueParser<Value = Algorithm> {
-    named_of(&Algorithm::VARIANTS[..Algorithm::VARIANTS.len() - 1])
+    let names = Algorithm::VARIANTS.iter().filter(|name| **name != Algorithm::Learned.into_str());
+    PossibleValuesParser::new(names).try_map(|name: String| name.parse::<Algorithm>())
 }
 
 /// Parses the names of the variants of `T`.
@@ -319,20 +331,6 @@ pub(super) fn frame_range(text: &str) -> Result<[usize; 2], String> {
             Err("name one index, or FIRST-LAST with both ends in".to_owned())
         }
     }
-}
-
-/// Parses names of all algorithms.
-pub(super) fn named_all() -> impl TypedValueParser<Value = Algorithm> {
-    named_of(Algorithm::VARIANTS)
-}
-
-fn named_of(algorithms: &[Algorithm]) -> impl TypedValueParser<Value = Algorithm> + use<> {
-    let names: Vec<&str> = algorithms.iter().map(|algorithm| algorithm.into_str()).collect();
-    PossibleValuesParser::new(names).try_map(|name: String| {
-        let named =
-            Algorithm::VARIANTS.iter().copied().find(|algorithm| algorithm.into_str() == name);
-        named.ok_or("no such algorithm")
-    })
 }
 
 #[cfg(test)]
@@ -372,7 +370,7 @@ mod tests {
         let spec = parse(&["--algorithm", "gap-tv", "--iterations", "7"]).resolve().unwrap();
         assert_eq!(spec.planned_iterations(), 7);
         assert!(spec.stages.iter().all(|stage| stage.tolerance == 0.0));
-        assert_eq!(parse(&[]).algorithm, Algorithm::PnpTvFastdvdnet);
+        assert_eq!(parse(&[]).algorithm(), Algorithm::PnpTvFastdvdnet);
         assert!(Command::try_parse_from(["test", "--algorithm", "magic"]).is_err());
         assert!(Command::try_parse_from(["test", "--iterations", "0"]).is_err());
     }

@@ -10,7 +10,7 @@ use serde::Deserialize;
 use super::output::print_line;
 use super::verdict;
 use super::{CliError, progress};
-use crate::cli::error::Result;
+use crate::cli::error::{Result, read_json};
 use engine::intake::{CaptureFiles, Report, calibrate, report_page};
 use formats::{Channels, FormatError, Limits, StackInfo, npy};
 
@@ -91,18 +91,16 @@ fn write_report(arguments: &Arguments, report: &Report) -> Result<()> {
 }
 
 fn read_index(path: &Path) -> Result<CaptureFiles> {
-    let refused = |error: &dyn std::fmt::Display| {
-        CliError::Input(format!("captures {}: {error}", path.display()))
-    };
-    let text = fs::read_to_string(path).map_err(|error| refused(&error))?;
-    let index: Index = serde_json::from_str(&text).map_err(|error| refused(&error))?;
+    let refused =
+        |problem: &str| CliError::Input(format!("captures {}: {problem}", path.display()));
+    let index: Index = read_json("captures", path)?;
     let folder = path.parent().unwrap_or(Path::new("."));
     let list = |files: Vec<PathBuf>| files.iter().map(|file| folder.join(file)).collect::<Vec<_>>();
     if let Some(missing) = index.masks.iter().position(Vec::is_empty) {
         return Err(refused(&format!("pattern {missing} (counted from 0) has no captures")));
     }
     if index.masks.is_empty() || index.white.is_empty() || index.black.is_empty() {
-        return Err(refused(&"masks, white and black each need captures"));
+        return Err(refused("masks, white and black each need captures"));
     }
     Ok(CaptureFiles {
         masks: index.masks.into_iter().map(list).collect(),

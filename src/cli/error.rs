@@ -1,9 +1,11 @@
 //! Errors of commands, with their exit codes.
 
 use std::fmt::Display;
-use std::fs::File;
+use std::fs::{self, File};
 use std::path::Path;
 use std::process::ExitCode;
+
+use serde::de::DeserializeOwned;
 
 use super::fields::{Role, as_options};
 use super::serve::ServeError;
@@ -66,6 +68,15 @@ pub fn open_input(path: &Path) -> Result<File> {
         FormatError::Io { source, .. } => CliError::file("read", path, &source),
         other => CliError::Input(format!("{}: {other}", path.display())),
     })
+}
+
+/// Reads a JSON file that the user names; `what` is its role.
+/// Errors: [`CliError::Input`].
+pub(super) fn read_json<T: DeserializeOwned>(what: &str, path: &Path) -> Result<T> {
+    let refused =
+        |error: &dyn Display| CliError::Input(format!("{what} {}: {error}", path.display()));
+    let text = fs::read_to_string(path).map_err(|error| refused(&error))?;
+    serde_json::from_str(&text).map_err(|error| refused(&error))
 }
 
 impl From<ReconError> for CliError {

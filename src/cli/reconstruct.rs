@@ -152,7 +152,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
     folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
-    let algorithm = arguments.schedule.algorithm;
+    let algorithm = arguments.schedule.algorithm();
     let model = model(arguments, &network)?;
     let snapshots = input.snapshots();
     let shape = input.shape();
@@ -259,7 +259,7 @@ fn folders(out: Option<&Path>, snapshots: &Range<usize>) -> Vec<(usize, PathBuf)
 
 fn model(arguments: &Arguments, network: &NetworkSource) -> Result<Option<Model>> {
     let Some(path) = &arguments.model else { return Ok(None) };
-    match arguments.schedule.algorithm {
+    match arguments.schedule.algorithm() {
         Algorithm::Learned => Model::open(path, network).map(Some),
         other => Err(CliError::Input(format!(
             "{} takes no --model; use --algorithm learned",

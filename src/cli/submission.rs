@@ -7,13 +7,13 @@ use serde_json::{Map, Value, json};
 
 use super::CliError;
 use super::arguments::{
-    DispersionArguments, MaskFileArguments, SnapshotFileArguments, Snapshots, named, named_all,
-    registration,
+    AlgorithmArguments, DispersionArguments, MaskFileArguments, SnapshotFileArguments, Snapshots,
+    named, registration,
 };
 use super::client::{Client, Result};
 use super::fields::Role;
 use engine::job::{
-    Algorithm, CalibrationId, Dispersion, JobId, Mosaic, RegistrationRequest, Sequence, Sha256,
+    CalibrationId, Dispersion, JobId, Mosaic, RegistrationRequest, Sequence, Sha256,
 };
 
 /// Options of the calibration, the measurement and the job.
@@ -64,16 +64,11 @@ pub(super) struct SubmissionArguments {
     /// Name of the measurement [default: none].
     #[arg(long, value_name = "TEXT", help_heading = MEASUREMENT)]
     name: Option<String>,
-    /// The algorithm.
-    #[arg(long, value_name = "NAME", default_value = Algorithm::PnpTvFastdvdnet.into_str(),
-          value_parser = named_all(), help_heading = JOB)]
-    algorithm: Algorithm,
+    #[command(flatten, next_help_heading = JOB)]
+    algorithm: AlgorithmArguments,
     /// The network of `learned`.
     #[arg(long, value_name = "ID", help_heading = JOB)]
     model: Option<String>,
-    /// A schedule as JSON (docs/schedule.schema.json) instead of the algorithm's default.
-    #[arg(long, value_name = "FILE", help_heading = JOB)]
-    schedule: Option<PathBuf>,
     /// The snapshots: all, an index from 0, or FIRST-LAST including both ends.
     #[arg(long, value_name = "WHICH", default_value = "all", help_heading = JOB)]
     snapshots: Snapshots,
@@ -184,7 +179,7 @@ impl SubmissionArguments {
 
     /// Uploads masks, dark captures and true frames, creates the calibration if necessary, and returns the requests.
     pub(super) async fn recipe(&self, client: &Client) -> Result<Recipe> {
-        let schedule = self.schedule()?;
+        let schedule = self.algorithm.schedule()?;
         let dispersion = self.dispersion.resolve()?;
         let calibration = match (&self.calibration, &self.masks, &self.registration_of) {
             (Some(_), ..) | (_, None, Some(_)) if dispersion.is_some() => {
@@ -269,12 +264,12 @@ impl SubmissionArguments {
     }
 
     /// A request for a job, without its measurement.
-    fn job_request(&self, schedule: Value, truth: Option<Sha256>) -> Map<String, Value> {
+    fn job_request(&self, schedule: Option<Value>, truth: Option<Sha256>) -> Map<String, Value> {
         let tile = self.tile.zip(self.overlap);
         let tile = tile.map(|(size, overlap)| json!({"size": size, "overlap": overlap}));
-        let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.into_str()))]);
+        let mut body = Map::from_iter([("algorithm".to_owned(), json!(self.algorithm.algorithm))]);
         add(&mut body, "model", json!(self.model));
-        add(&mut body, "schedule", schedule);
+        add(&mut body, "schedule", json!(schedule));
         add(&mut body, "snapshots", self.snapshots.request());
         add(&mut body, "sequence", json!(self.sequence.map(|kind| kind.to_string())));
         add(&mut body, "tile", json!(tile));
@@ -282,15 +277,6 @@ impl SubmissionArguments {
         add(&mut body, "truth", json!(truth));
         self.plain.add_to(&mut body);
         body
-    }
-
-    fn schedule(&self) -> Result<Value, CliError> {
-        let Some(path) = &self.schedule else { return Ok(Value::Null) };
-        let refused = |error: &dyn std::fmt::Display| {
-            CliError::Input(format!("schedule {}: {error}", path.display()))
-        };
-        let text = std::fs::read_to_string(path).map_err(|error| refused(&error))?;
-        serde_json::from_str(&text).map_err(|error| refused(&error))
     }
 }
 
@@ -428,7 +414,7 @@ mod tests {
         assert_eq!(names(calibration.as_object().unwrap()), expected);
         let measurement = arguments.measurement_request("id", &[sha256]);
         assert_eq!(names(&measurement), properties("MeasurementRequest", &["data"]));
-        let job = arguments.job_request(arguments.schedule().unwrap(), Some(sha256));
+        let job = arguments.job_request(arguments.algorithm.schedule().unwrap(), Some(sha256));
         // The measurement names the calibration.
         assert_eq!(names(&job), properties("JobRequest", &["measurement", "calibration"]));
         assert_eq!(job["tile"], serde_json::json!({"size": 128, "overlap": 16}));

@@ -1,7 +1,7 @@
 //! Reconstruction algorithms with their default schedules, tiles and priors.
 
 use serde::{Deserialize, Serialize};
-use strum::{IntoStaticStr, VariantArray};
+use strum::{EnumString, IntoStaticStr, VariantArray};
 
 use super::shape::TileSpec;
 use reconstruction::priors::registry::PriorName;
@@ -9,7 +9,8 @@ use reconstruction::schedule::Schedule;
 
 /// A reconstruction algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[derive(Serialize, Deserialize, IntoStaticStr, VariantArray, schemars::JsonSchema)]
+#[derive(Serialize, Deserialize, schemars::JsonSchema)]
+#[derive(EnumString, IntoStaticStr, VariantArray, strum::VariantNames)]
 #[serde(rename_all = "kebab-case")]
 #[strum(serialize_all = "kebab-case", const_into_str)]
 pub enum Algorithm {
