@@ -103,9 +103,9 @@ impl Forecast {
         (self.workers > 0).then_some(seconds)
     }
 
-    /// Seconds that a worker takes for planned CPU-seconds of a task that is no tile.
-    pub(crate) fn other_seconds(&self, cost: f64) -> f64 {
-        self.others_rate * cost
+    /// Seconds that a worker takes for planned CPU-seconds of a task that is no tile; `None` without a worker.
+    pub(crate) fn other_seconds(&self, cost: f64) -> Option<f64> {
+        (self.workers > 0).then_some(self.others_rate * cost)
     }
 
     /// The place of a job that waits among all that do, from 1.

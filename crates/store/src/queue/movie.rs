@@ -91,19 +91,16 @@ impl Store {
         Ok(Movie::Asked(None))
     }
 
-    /// Estimated seconds until a worker has made a movie, from the share that is done; `None` if no worker lives. A movie
-    /// that waits is made after all jobs.
+    /// Estimated seconds of a worker for the rest of a movie, from the share that is done; `None` if no worker lives. A
+    /// movie precedes the jobs of its lab, so the estimate leaves out the queue.
     pub async fn movie_seconds(
         &self,
         job: &Job,
         (snapshot, format): (Option<u32>, MovieFormat),
         done: Option<f64>,
     ) -> Result<Option<f64>> {
-        let cost = job.spec.movie_cost(format, snapshot);
-        match done {
-            Some(done) => Ok(Some(self.forecast().await?.other_seconds(cost * (1.0 - done)))),
-            None => Ok(self.estimate(&[(format.task(snapshot), cost)]).await?.eta_seconds),
-        }
+        let left = job.spec.movie_cost(format, snapshot) * (1.0 - done.unwrap_or(0.0));
+        Ok(self.forecast().await?.other_seconds(left))
     }
 
     /// The values to show as black and as white in a movie; `None` for the job's white level.
