@@ -26,8 +26,8 @@ use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, Dispersion, Finding, Inputs, MaskInputs, MeasurementInputs, Mosaic,
-    Registered, RegistrationRequest, SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
+    Algorithm, Assessment, Dispersion, Finding, Grade, Inputs, MaskInputs, MeasurementInputs,
+    Mosaic, Registered, RegistrationRequest, SceneShape, Schedule, Sequence, Sha256, keeps_mosaic,
 };
 use engine::pipeline::manifest::{Manifest, Recipe, ScaleRecord, VERSION};
 use engine::pipeline::networks::NetworkSource;
@@ -233,7 +233,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
     let assessments = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
     report.assessment = Assessment::combined(assessments);
-    report.findings = verdict::merge(&input.findings, report.assessment.as_ref());
+    report.findings = Assessment::findings(&input.findings, report.assessment.as_ref());
+    report.verdict = Assessment::verdict(&report.findings, report.assessment.as_ref());
     for (snapshot, folder) in folders {
         let tiles = solved.records(&sequence, snapshot);
         let expected = expected.get(snapshot - input.first).cloned().flatten();
@@ -244,7 +245,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
     }
     report.print(arguments)?;
-    verdict::refuse_bad([(&*report.findings, report.assessment.as_ref())])
+    verdict::refuse_bad([(&*report.findings, report.verdict)])
 }
 
 /// The output folder of each snapshot.
@@ -596,6 +597,8 @@ struct Report {
     psnr_unit_db: Option<f64>,
     /// The 99.9th percentile of all frames.
     white_level: f32,
+    /// The verdict on the frames; `None` if nothing was found and there is no prediction.
+    verdict: Option<Grade>,
     /// The predicted quality of the frames, as a mean over the snapshots.
     assessment: Option<Assessment>,
     /// PSNR of each snapshot. Empty if the truth is unknown.
@@ -648,6 +651,7 @@ impl Report {
             psnr_db: quality.as_ref().map(|quality| quality.psnr),
             psnr_unit_db,
             white_level,
+            verdict: None,
             assessment: None,
             psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
             ssim: quality.as_ref().and_then(|quality| quality.ssim),
@@ -685,7 +689,7 @@ impl Report {
             self.denoiser_passes,
             self.stop_reason
         ))?;
-        print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
+        print_line(Assessment::verdict_text(self.verdict, self.assessment.as_ref()))?;
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(
