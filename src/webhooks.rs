@@ -171,6 +171,8 @@ fn message(job: &Job) -> Value {
             "state": job.state,
             "error": job.error,
             "warnings": job.spec.warnings,
+            "verdict": job.verdict(),
+            "verdict_text": job.verdict_text(),
             "assessment": job.assessment,
         },
     })

@@ -8,8 +8,9 @@ function [frames, job] = sci_recon(masks, measurement, varargin)
 %   FRAMES = SCI_RECON(ID) returns the frames of an existing job, such as one that was submitted in the dashboard. It
 %   waits for a job that has not ended.
 %
-%   [FRAMES, JOB] = ... also returns the service's description of the job. Findings of the checks are warnings with the
-%   identifier sci_recon:CODE and the remedy.
+%   [FRAMES, JOB] = ... also returns the service's description of the job. Its verdict on the frames is JOB.verdict in a
+%   word, and JOB.verdict_text in a line, which is printed. Findings of the checks are warnings with the identifier
+%   sci_recon:CODE and the remedy.
 %
 %   SCI_RECON(..., NAME, VALUE, ...). For an existing job, only 'url', 'token' and 'quiet' matter:
 %     'url'         address of the service   (default: environment SCI_RECON_URL, or http://127.0.0.1:8080)
@@ -121,6 +122,9 @@ function [frames, job] = collect(o, job)
   end
   if isstruct(job.assessment)
     warn(job.assessment.reasons, codes);
+  end
+  if ~o.quiet
+    fprintf('%s\n', job.verdict_text);
   end
 
   frames = [];

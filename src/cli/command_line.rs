@@ -115,7 +115,7 @@ fn command() -> clap::Command {
         }
     }
     template += "\nOptions:\n{options}\n\n`sci-recon COMMAND --help` describes the options of a command.\n\n\
-                 Exit codes: 0 success, 1 failure, 2 wrong input, 3 done, but the checks found errors or the verdict is bad.";
+                 Exit codes: 0 success, 1 failure, 2 wrong input, 3 done, but the verdict is bad.";
     root.help_template(template)
 }
 

@@ -35,7 +35,7 @@ impl End {
             state: job.state.to_string(),
             label: job.label.clone().unwrap_or_default(),
             error: job.error.clone().unwrap_or_default(),
-            verdict: job.verdict().unwrap_or_default(),
+            verdict: job.verdict_text.clone().unwrap_or_default(),
         }
     }
 }

@@ -61,7 +61,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         match arguments.json {
             true => print_line(json!({
                 "job": job.id, "files": files,
-                "assessment": job.assessment, "findings": findings, "comparison": comparison,
+                "verdict": job.verdict, "assessment": job.assessment, "findings": findings, "comparison": comparison,
             }))?,
             false => {
                 comparison.iter().for_each(|comparison| eprintln!("{}", comparison.indented()));
@@ -71,6 +71,6 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         if let Some(difference) = comparison.and_then(|comparison| comparison.failure(&job.id)) {
             return Err(CliError::Failure(difference));
         }
-        verdict::refuse_bad([(&*findings, job.assessment.as_ref())])
+        verdict::refuse_bad([(&*findings, job.verdict)])
     })
 }

@@ -43,7 +43,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             let Job { id, created_at, algorithm, .. } = &job;
             let state = verdict::state_word(job.state);
             let percent = job.progress.percent;
-            let verdict = job.verdict().unwrap_or_default();
+            let verdict = job.verdict_text.as_deref().unwrap_or_default();
             let label = job.label.as_deref().unwrap_or_default();
             let line = format!("{id}  {state:9}  {percent:3.0} %  {created_at}  {algorithm:18}");
             print_line(format!("{line}  {label:20}  {verdict}").trim_end())?;

@@ -26,7 +26,7 @@ use engine::intake::{
     self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
 };
 use engine::job::{
-    Algorithm, Assessment, CalibrationId, CalibrationRequest, Dispersion, Finding, Inputs,
+    Algorithm, Assessment, CalibrationId, CalibrationRequest, Dispersion, Finding, Grade, Inputs,
     MeasurementRequest, Mosaic, Registered, RegistrationRequest, SceneShape, Schedule, Sequence,
     Sha256, keeps_mosaic,
 };
@@ -237,7 +237,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut report = Report::new(&recipe, &sequence, &solved, &run, quality);
     let assessments = expected.iter().map(|expected| Some(&expected.as_ref()?.assessment));
     report.assessment = Assessment::combined(assessments);
-    report.findings = verdict::merge(&input.findings, report.assessment.as_ref());
+    report.findings = Assessment::findings(&input.findings, report.assessment.as_ref());
+    report.verdict = Assessment::verdict(&report.findings, report.assessment.as_ref());
     for (snapshot, folder) in folders {
         let tiles = solved.records(&sequence, snapshot);
         let expected = expected.get(snapshot - input.first).cloned().flatten();
@@ -248,7 +249,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         write(&folder, manifest, error.as_ref().map(|error| error.view()), frame)?;
     }
     report.print(arguments)?;
-    verdict::refuse_bad([(&*report.findings, report.assessment.as_ref())])
+    verdict::refuse_bad([(&*report.findings, report.verdict)])
 }
 
 /// The output folder of each snapshot.
@@ -599,6 +600,8 @@ struct Report {
     psnr_unit_db: Option<f64>,
     /// The 99.9th percentile of all frames.
     white_level: f32,
+    /// The verdict on the frames; `None` if nothing was found and there is no prediction.
+    verdict: Option<Grade>,
     /// The predicted quality of the frames, as a mean over the snapshots.
     assessment: Option<Assessment>,
     /// PSNR of each snapshot. Empty if the truth is unknown.
@@ -651,6 +654,7 @@ impl Report {
             psnr_db: quality.as_ref().map(|quality| quality.psnr),
             psnr_unit_db,
             white_level,
+            verdict: None,
             assessment: None,
             psnr_db_by_snapshot: by_frame.chunks(frames).map(mean).collect(),
             ssim: quality.as_ref().and_then(|quality| quality.ssim),
@@ -688,7 +692,7 @@ impl Report {
             self.denoiser_passes,
             self.stop_reason
         ))?;
-        print_line(verdict::verdict(self.assessment.as_ref(), &self.findings))?;
+        print_line(Assessment::verdict_text(self.verdict, self.assessment.as_ref()))?;
         verdict::lines(&self.findings).iter().try_for_each(print_line)?;
         for decided in self.pilot.iter().flat_map(|pilot| &pilot.stages) {
             print_line(format!(

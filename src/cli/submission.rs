@@ -173,6 +173,11 @@ impl SubmissionArguments {
             .chain(&self.truth)
     }
 
+    /// True if snapshots are packed pixels, whose files may have no header.
+    pub(super) fn is_packed(&self) -> bool {
+        self.snapshot_file.packing.is_some()
+    }
+
     /// Options that do not change the frames.
     pub(super) fn plain(&self) -> &PlainArguments {
         &self.plain

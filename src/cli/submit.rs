@@ -55,7 +55,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
             print_line(&job.id)?;
             verdict::lines(&job.warnings).iter().for_each(|line| eprintln!("{line}"));
         }
-        verdict::refuse_bad([(&*job.warnings, None)])
+        verdict::refuse_bad([(&*job.warnings, job.verdict)])
     })
 }
 

@@ -96,7 +96,7 @@ async fn report(
         match as_json {
             true => print_line(json!({
                 "id": job.id, "state": job.state, "error": job.error,
-                "assessment": job.assessment, "findings": job.findings(), "comparison": comparison,
+                "verdict": job.verdict, "assessment": job.assessment, "findings": job.findings(), "comparison": comparison,
             }))?,
             false => {
                 print_line(job.summary())?;
@@ -109,6 +109,6 @@ async fn report(
         return Err(CliError::Failure(failures.join("; ")));
     }
     let findings: Vec<_> = jobs.iter().map(Job::findings).collect();
-    let assessments = jobs.iter().map(|job| job.assessment.as_ref());
-    verdict::refuse_bad(findings.iter().map(Vec::as_slice).zip(assessments))
+    let verdicts = jobs.iter().map(|job| job.verdict);
+    verdict::refuse_bad(findings.iter().map(Vec::as_slice).zip(verdicts))
 }

@@ -18,8 +18,8 @@ use super::page::{Cursor, Limit, PageBody};
 use super::truth;
 use engine::intake;
 use engine::job::{
-    Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, InvalidField, JobId,
-    JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Registered,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, FindingCode, Grade, InvalidField,
+    JobId, JobRequest, JobSpec, JobState, Lab, Label, MeasurementId, ModelId, Registered,
     RegistrationRequest, Role, RunSpec, SceneShape, Schedule, Sequence, Sha256, SnapshotRange,
     TileSpec, Timestamp, Webhook, priority_error,
 };
@@ -65,6 +65,13 @@ pub(super) struct JobBody {
     created_at: Timestamp,
     started_at: Option<Timestamp>,
     finished_at: Option<Timestamp>,
+    /// The verdict on the frames, which every client shows: `bad` after errors, `doubtful` if a finding questions the scale,
+    /// the dark or the masks, otherwise by the expected PSNR. Before the end only findings count. Null if nothing was found and no
+    /// quality can be predicted, and for jobs that have failed or were cancelled.
+    verdict: Option<Grade>,
+    /// The verdict in a line, with the expected PSNR, the threshold that it missed, and why the order of the masks is not
+    /// verified. Null until the job has succeeded.
+    verdict_text: Option<String>,
     /// Predicted quality of the frames, mean over the snapshots. Null until the job has succeeded, and where no prediction
     /// is possible: colour sensors, models of users, and schedules without a quality model.
     assessment: Option<Assessment>,
@@ -170,6 +177,7 @@ impl JobBody {
             _ => None,
         };
         let webhook = WebhookBody::new(app, &job).await?;
+        let (verdict, verdict_text) = (job.verdict(), job.verdict_text());
         let spec = job.spec;
         let shape = spec.frame_shape();
         Ok(Self {
@@ -198,6 +206,8 @@ impl JobBody {
             created_at: job.created_at,
             started_at: job.started_at,
             finished_at: job.finished_at,
+            verdict,
+            verdict_text,
             assessment: job.assessment,
             webhook,
             progress,

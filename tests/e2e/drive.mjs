@@ -1,5 +1,6 @@
 // The walks of a user through the dashboard.
 
+import { readFileSync } from "node:fs";
 import { scene as drawn } from "./scene.mjs";
 
 export const HOSTILE = "<img src=x onerror=alert(1)>";
@@ -89,6 +90,43 @@ export async function submit(page, checks, scene, small) {
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
   return page.url().slice(-36);
+}
+
+/** Reconstructs a MATLAB 7.3 file with names of somebody's own: arrays are clicked, and nothing is typed. */
+export async function matlab(page, checks, service) {
+  const bytes = readFileSync(new URL("../data/formats/bench73.mat", import.meta.url));
+  await page.click("#nav >> text=New job");
+  await page.check("input[value=masks]");
+  await drop(page, "label.drop:has(#masks)", "bench73.mat", bytes);
+  await page.waitForSelector(".arraychoice:has-text('64 × 64 × 8') >> text=patterns");
+  await page.click(".askscale >> text=patterns");
+  await page.waitForSelector("text=The calibration is accepted.");
+  await drop(page, "label.drop:has(#data)", "bench73.mat", bytes);
+  await page.click(".askscale >> text=shots");
+  await page.waitForSelector("text=The measurement fits the calibration.");
+  await page.selectOption("#algorithm", "gap-tv");
+  await page.click("button[type=submit]");
+  await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
+  await state(page, "succeeded");
+  const id = page.url().slice(-36);
+  const answer = await fetch(`${service.url}/v1/jobs/${id}/exports/npy`);
+  const file = Buffer.from(await answer.arrayBuffer());
+  const frames = new Float32Array(file.buffer.slice(file.byteOffset + 10 + file.readUInt16LE(8), file.byteOffset + file.length));
+  const truth = frames.map((_, at) => {
+    const [frame, row, column] = [at >> 12, (at >> 6) & 63, at & 63];
+    const inside = row >= 20 && row < 36 && column >= 4 + 5 * frame && column < 20 + 5 * frame;
+    return inside ? 0.95 : 0.35 + 0.2 * Math.sin(column / 9) * Math.cos(row / 13);
+  });
+  const sum = (value) => truth.reduce((total, _, at) => total + value(at), 0);
+  const scale = sum((at) => frames[at] * truth[at]) / sum((at) => truth[at] ** 2);
+  const psnr = -10 * Math.log10(sum((at) => (frames[at] / scale - truth[at]) ** 2) / truth.length);
+  checks.that(frames.length === 8 * 64 * 64 && psnr > 20, `the frames of a MATLAB file are right: ${psnr} dB`);
+  const { verdict } = await service.call("GET", `/v1/jobs/${id}`);
+  const shown = await page.textContent(".judgement");
+  checks.that(["good", "usable"].includes(verdict) && shown.toLowerCase().includes(verdict), `the page shows the verdict ${verdict}: ${shown}`);
+  const ends = await checks.until(() => page.$$eval(".contrast .ends", (all) => all.map((one) => one.textContent)), (all) => all.some((one) => one.includes("61234")), "the largest count has all its digits");
+  checks.that(!ends.some((one) => one.includes("61200")), `no count is rounded: ${ends}`);
+  await checks.look(page, "matlab");
 }
 
 /** Reconstructs a measurement of a colour sensor, from the form to frames in colour. */

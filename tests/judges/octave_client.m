@@ -32,6 +32,11 @@ lastwarn('', '');
 assert(isequal(size(one), [144 160 8]));
 [~, code] = lastwarn();
 assert(strncmp(code, 'sci_recon:', 10), 'no finding is a warning: %s', code);
+% The verdict is the service's, and the line of it is printed unless the client is quiet.
+assert(any(strcmp(wrong.verdict, {'doubtful', 'bad'})), 'the verdict without a dark is %s', wrong.verdict);
+assert(strncmp(wrong.verdict_text, [wrong.verdict ', no expected PSNR'], numel(wrong.verdict) + 18));
+line = evalc('sci_recon(wrong.id);');
+assert(~isempty(strfind(line, wrong.verdict_text)), 'the verdict is not printed: %s', line);
 % The request is repeated, because its connection may be cut.
 for k = 1:5
   system(sprintf('curl -s -o /dev/null -X DELETE -H "Authorization: Bearer %s" %s/v1/jobs/%s', ...

@@ -39,7 +39,8 @@ def napari(result):
     for path, frames in expected.items():
         [(data, settings, kind)] = npe2.read([path], stack=False)
         assert kind == "image" and np.array_equal(data, frames), path
-        assert not settings["rgb"] and settings["contrast_limits"][1] > 0.1, settings
+        white = result.manifest["content"]["scale"]["white_level"]
+        assert not settings["rgb"] and settings["contrast_limits"] == (0.0, white), settings
     try:
         npe2.read([str(folder / "frames.npy")], stack=False)
         raise AssertionError("a file of another plugin was opened")
@@ -56,6 +57,10 @@ def jupyter(result):
     height, width = frames.shape[1:3]
     assert picture.n_frames == len(frames) and 64 <= max(picture.size) <= 384, picture
     assert abs(picture.width / picture.height - width / height) < 0.02, picture
+    step = max(1, round(max(height, width) / 256))
+    white = result.manifest["content"]["scale"]["white_level"]
+    expected = np.uint8(np.clip(frames[0][::step, ::step] / white, 0, 1) * 255)
+    assert np.array_equal(np.asarray(picture.convert("L")), expected), "white is the white level of the job"
 
 
 def unreachable():

@@ -28,7 +28,8 @@ async fn a_result_has_an_expected_psnr_and_an_error_map() {
     );
     assert!(figure("psnr_db") > 5.0 && figure("psnr_high_db") <= 40.0, "{expected_quality}");
     assert!(
-        ["good", "usable", "bad"].contains(&expected_quality["grade"].as_str().unwrap()),
+        ["good", "usable", "doubtful", "bad"]
+            .contains(&expected_quality["grade"].as_str().unwrap()),
         "{expected_quality}"
     );
     let job_manifest =

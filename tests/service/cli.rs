@@ -103,6 +103,7 @@ fn a_simulated_snapshot_is_reconstructed() {
             "stop_reason",
             "white_level",
             "pilot",
+            "verdict",
             "assessment",
             "findings",
         ];

@@ -108,35 +108,66 @@ fn options_of_matlab_are_the_properties_of_the_contract() {
     }
 }
 
-/// The hot folder in Python, started twice: a job for each file, a report with its results.
+/// The hot folder in Python, started several times: a job for each file, and its verdict and findings with its results.
 #[tokio::test]
 async fn python_watches_a_folder() {
     let Some(python) = judges() else { return };
     let app = TestApp::with(&["--workers", "1"]).await;
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    std::fs::write(path("masks.npy"), Scene::SMALL.masks()).unwrap();
-    std::fs::write(path("drop.npy"), Scene::SMALL.snapshots()).unwrap();
-    std::fs::write(path("small.npy"), constant(&[1, 8, 8], 0.5)).unwrap();
-    for status in [1, 0] {
+    let scene = Scene { frames: 4, height: 128, width: 128, snapshots: 1 };
+    let watch = async || {
         let mut watch = tokio::process::Command::new(&python);
         watch.env("PYTHONPATH", "clients/python/src");
         watch.env("SCI_RECON_URL", format!("http://{}", app.address()));
         watch.args(["-m", "sci_recon", "watch", "--algorithm=gap-tv", "--once"]);
-        watch.args(["--settle-seconds=0.1", "--masks"]).arg(path("masks.npy")).arg(folder.path());
-        let output = watch.output().await.unwrap();
-        let errors = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(status), "a file failed in the first run: {errors}");
-    }
-    let report = std::fs::read_to_string(path("drop.npy.result/REPORT.txt")).unwrap();
+        watch.args(["--settle-seconds=0.1", "--crop=0,0,128,128", "--masks-frames=0-3"]);
+        for (option, file) in
+            [("--masks", "masks.npy"), ("--bad-pixels", "map.npy"), ("--truth", "truth.npy")]
+        {
+            watch.arg(option).arg(path(file));
+        }
+        let output = watch.arg(folder.path()).output().await.unwrap();
+        let text = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+        (output.status.code(), text.concat())
+    };
+    // These files belong to every snapshot, so they are no snapshots themselves.
+    std::fs::write(path("masks.npy"), scene.masks()).unwrap();
+    std::fs::write(path("map.npy"), constant(&[128, 128], 0.0)).unwrap();
+    std::fs::write(path("truth.npy"), constant(&[4, 128, 128], 0.5)).unwrap();
+    let outside = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(outside.path(), scene.snapshots()).unwrap();
+    let mut savez = std::process::Command::new(&python);
+    savez.args(["-c", "import sys, numpy; numpy.savez(sys.argv[2], meas=numpy.load(sys.argv[1]))"]);
+    assert!(savez.arg(outside.path()).arg(path("drop.npz")).status().unwrap().success());
+    std::fs::write(path("small.npy"), constant(&[1, 8, 8], 0.5)).unwrap();
+    let (status, text) = watch().await;
+    assert_eq!(status, Some(1), "small.npy has failed: {text}");
+    let reason = std::fs::read_to_string(path("small.npy.failed.txt")).unwrap();
+    assert!(reason.contains("shape_mismatch") || reason.contains("crop"), "{reason}");
     let jobs = app.get("/v1/jobs").await.expect(200).json();
     assert_eq!(jobs["items"].as_array().unwrap().len(), 1, "{jobs}");
-    assert!(report.contains(jobs["items"][0]["id"].as_str().unwrap()), "{report}");
-    assert!(path("drop.npy.result/snapshot_0000/frames.npy").exists());
-    assert!(path("drop.npy.result/snapshot_0000/stack.tif").exists());
-    let reason = std::fs::read_to_string(path("small.npy.failed.txt")).unwrap();
-    assert!(reason.contains("size_mismatch"), "{reason}");
-    assert!(!path("drop.npy.2.result").exists() && !path("small.npy.2.failed.txt").exists());
+    let job = &jobs["items"][0];
+    assert!(job["truth"].is_string() && job["verdict"] != "bad", "{job:#}");
+    let report = std::fs::read_to_string(path("drop.npz.result/REPORT.txt")).unwrap();
+    let verdict = job["verdict_text"].as_str().unwrap();
+    assert!(report.starts_with(&format!("drop.npz: {verdict}\n")), "{report}");
+    assert!(report.contains(job["id"].as_str().unwrap()), "{report}");
+    assert!(path("drop.npz.result/snapshot_0000/frames.npy").exists());
+    assert!(path("drop.npz.result/snapshot_0000/stack.tif").exists());
+    assert_eq!(watch().await.0, Some(0), "files that were processed are not processed again");
+    // Masks in place of snapshots.
+    std::fs::write(path("oops.npy"), scene.masks()).unwrap();
+    let (status, text) = watch().await;
+    assert_eq!(status, Some(3), "{text}");
+    assert!(text.contains("oops.npy is in oops.npy.result: bad, no expected PSNR"), "{text}");
+    let report = std::fs::read_to_string(path("oops.npy.result/REPORT.txt")).unwrap();
+    let findings = report.lines().filter(|line| line.starts_with("error "));
+    assert!(report.starts_with("oops.npy: bad") && findings.count() > 0, "{report}");
+    assert!(report.contains("Remedy: "), "{report}");
+    let count = app.get("/v1/jobs").await.expect(200).json()["items"].as_array().unwrap().len();
+    assert_eq!(count, 2);
+    assert!(!path("drop.npz.2.result").exists() && !path("small.npy.2.failed.txt").exists());
 }
 
 /// Runs a notebook of the Python client against a service, and returns the judge's report.

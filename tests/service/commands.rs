@@ -701,6 +701,20 @@ async fn a_watched_folder_reports_files_that_it_skips() {
     assert!(!text.contains("notes.txt"), "{text}");
     let errors = String::from_utf8(watched.stderr).unwrap();
     assert!(errors.contains("3 files were skipped"), "{errors}");
+
+    // Archives are submitted. Bytes without a header are, too, if their packing is stated.
+    std::fs::create_dir(lab.path("kinds")).unwrap();
+    let kinds = ["npz", "zip", "tar", "raw"];
+    kinds.iter().for_each(|ending| lab.write(&format!("kinds/drop.{ending}"), b"no snapshot"));
+    let watch = ["watch-folder", "kinds", "--once", "--settle-seconds", "0.1"];
+    let refused =
+        || kinds.map(|ending| lab.path(&format!("kinds/drop.{ending}.failed.txt")).exists());
+    let masks = ["--masks", "masks.npy"];
+    assert_eq!(lab.run(&[&watch[..], &masks].concat()).await.status.code(), Some(1));
+    assert_eq!(refused(), [true, true, true, false]);
+    let packed = [&watch[..], &masks, &["--packing", "mono12p"]].concat();
+    assert_eq!(lab.run(&packed).await.status.code(), Some(1));
+    assert_eq!(refused(), [true; 4]);
 }
 
 #[tokio::test]

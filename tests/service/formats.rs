@@ -183,6 +183,24 @@ async fn every_row_of_the_tables_holds() {
     }
 }
 
+/// Walks the small files in `cases` of the shared data, if they are available.
+#[tokio::test]
+async fn files_that_once_failed_are_read_or_refused_in_words() {
+    let shared = std::env::var_os("SCI_RECON_SHARED").unwrap_or("../shared".into());
+    let folder = Path::new(&shared).join("cases");
+    if !folder.exists() {
+        println!("skipped: {} is not there (SCI_RECON_SHARED names its parent)", folder.display());
+        return;
+    }
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let mut judge = tokio::process::Command::new(python);
+    judge.env("PYTHONPATH", "clients/python/src");
+    judge.env("SCI_RECON_URL", format!("http://{}", app.address()));
+    let output = judge.arg("tests/judges/shared_cases.py").arg(folder).output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
 /// An npy file of integers of `bytes` bytes.
 fn integers(code: &str, bytes: usize, shape: &[usize], value: impl Fn(usize) -> u8) -> Vec<u8> {
     let count = shape.iter().product();

@@ -4,7 +4,7 @@ use std::process::Command;
 
 use serde_json::{Value, json};
 
-use crate::app::{TestApp, id};
+use crate::app::{TestApp, has_programs, id, judges};
 use crate::pipeline::values;
 use crate::samples::{Scene, constant, npy};
 
@@ -71,17 +71,24 @@ fn enlarged(masks: &[f32], factor: f32) -> Vec<f32> {
 
 /// The assessment and the codes of the findings.
 fn reconstruct(masks: &[f32], y: &[f32]) -> (Value, Vec<String>) {
+    reconstruct_after(masks, y, None)
+}
+
+/// The assessment and the codes of the findings, after an even dark was subtracted.
+fn reconstruct_after(masks: &[f32], y: &[f32], dark: Option<f32>) -> (Value, Vec<String>) {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let shape = [masks.len() / PIXELS, SIDE, SIDE];
     std::fs::write(path("masks.npy"), npy(&shape, masks.iter().copied())).unwrap();
     std::fs::write(path("y.npy"), npy(&[SIDE, SIDE], y.iter().copied())).unwrap();
-    let output = Command::new(env!("CARGO_BIN_EXE_sci-recon"))
-        .args(["reconstruct", "--masks", "masks.npy", "--measurement", "y.npy", "--json"])
-        .args(["--algorithm", "gap-tv", "--iterations", "60", "--registration", "off"])
-        .current_dir(folder.path())
-        .output()
-        .unwrap();
+    let mut program = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+    program.args(["reconstruct", "--masks", "masks.npy", "--measurement", "y.npy", "--json"]);
+    program.args(["--algorithm", "gap-tv", "--iterations", "60", "--registration", "off"]);
+    if let Some(level) = dark {
+        std::fs::write(path("dark.npy"), constant(&[SIDE, SIDE], level)).unwrap();
+        program.args(["--dark", "dark.npy"]);
+    }
+    let output = program.current_dir(folder.path()).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr);
     assert!([Some(0), Some(3)].contains(&output.status.code()), "{text}");
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -212,11 +219,140 @@ fn a_drift_by_a_fraction_of_a_pixel_is_no_missing_dark() {
     let (masks, y) = scene();
     let next = |at: usize| if at % SIDE + 1 < SIDE { masks[at + 1] } else { masks[at] };
     let drifted: Vec<f32> = (0..masks.len()).map(|at| 0.65 * masks[at] + 0.35 * next(at)).collect();
-    let (_, codes) = reconstruct(&drifted, &y);
+    let (assessment, codes) = reconstruct(&drifted, &y);
     assert_eq!(codes[0], "drifted_masks", "{codes:?}");
+    assert_eq!((&assessment["grade"], &assessment["psnr_db"]), (&"doubtful".into(), &Value::Null));
     let lifted: Vec<f32> = y.iter().map(|y| y + 0.2).collect();
-    let (_, codes) = reconstruct(&masks, &lifted);
+    let (assessment, codes) = reconstruct(&masks, &lifted);
     assert_eq!(codes[0], "no_dark", "{codes:?}");
+    assert_eq!(assessment["psnr_db"], Value::Null);
+    assert!(["doubtful", "bad"].contains(&assessment["grade"].as_str().unwrap()), "{assessment}");
+    let lifted: Vec<f32> = y.iter().map(|y| y + 0.3).collect();
+    let (assessment, codes) = reconstruct_after(&masks, &lifted, Some(0.1));
+    assert_eq!(codes[0], "wrong_dark", "{codes:?}");
+    assert_eq!(assessment["psnr_db"], Value::Null);
+    assert!(["doubtful", "bad"].contains(&assessment["grade"].as_str().unwrap()), "{assessment}");
+}
+
+/// Square masks in the order of axes that `h5write` of MATLAB leaves, which the sizes can't show.
+#[tokio::test]
+async fn the_axes_of_square_masks_are_named() {
+    let Some(python) = judges() else { return };
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let (masks, y) = scene();
+    std::fs::write(path("in.npy"), npy(&[FRAMES, SIDE, SIDE], masks.into_iter())).unwrap();
+    let line = "import sys, h5py, numpy
+h5py.File(sys.argv[2], 'w')['masks'] = numpy.load(sys.argv[1]).transpose(0, 2, 1)";
+    let mut write = Command::new(python);
+    write.args(["-c", line]).arg(path("in.npy")).arg(path("masks.h5"));
+    assert!(write.status().unwrap().success());
+    let masks = app.upload(std::fs::read(path("masks.h5")).unwrap()).await;
+    let data = npy(&[SIDE, SIDE], y.into_iter());
+    let made = app.post("/v1/calibrations", &json!({ "masks": masks })).await.expect(201);
+    let taken = app.measure(&id(&made), data.clone()).await.expect(201).json();
+    let found = &taken["warnings"][0];
+    assert_eq!(found["code"], "turned_masks", "{taken:#}");
+    assert!(found["detail"].as_str().unwrap().contains("state `frame-column-row` as `axes`"));
+    let asked = json!({"masks": masks, "axes": "frame-column-row"});
+    let made = app.post("/v1/calibrations", &asked).await.expect(201);
+    let taken = app.measure(&id(&made), data).await.expect(201).json();
+    assert_eq!(taken["warnings"], json!([]), "{taken:#}");
+}
+
+/// Prints word and text of a job's verdict as `clients/python` shows them.
+const PYTHON_VERDICT: &str = "
+import sys, sci_recon
+job = sci_recon.Client().job(sys.argv[1])
+print(job.record['verdict'], job.verdict, sep='|')";
+
+/// Prints the word of a job's verdict as the dashboard's list shows it. Node takes modules from a file with this ending.
+const DASHBOARD_VERDICT: &str = "
+import(process.argv[1]).then(({ verdictOf }) => console.log(verdictOf(JSON.parse(process.argv[2]))[1]))";
+
+/// Prints word and text of a job's verdict as `clients/matlab` shows them.
+const MATLAB_VERDICT: &str = "
+addpath('clients/matlab'); [~, job] = sci_recon(getenv('JOB'));
+printf('%s|%s', job.verdict, job.verdict_text);";
+
+/// The output of a program that must end with this code.
+async fn printed(app: &TestApp, mut program: tokio::process::Command, code: i32) -> String {
+    program.env("SCI_RECON_URL", format!("http://{}", app.address()));
+    let output = program.env("PYTHONPATH", "clients/python/src").output().await.unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{program:?}: {errors}");
+    String::from_utf8(output.stdout).unwrap().trim().to_owned()
+}
+
+#[tokio::test]
+async fn every_way_shows_the_same_verdict() {
+    use tokio::process::Command;
+    let Some(python) = judges() else { return };
+    if !has_programs(&["node", "octave-cli"], "nodejs octave") {
+        return;
+    }
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    std::fs::copy("src/http/dashboard/format.js", path("format.mjs")).unwrap();
+    let (masks, y) = scene();
+    std::fs::write(path("y.npy"), npy(&[SIDE, SIDE], y.iter().copied())).unwrap();
+    let next = |at: usize| if at % SIDE + 1 < SIDE { masks[at + 1] } else { masks[at] };
+    let drifted: Vec<f32> = (0..masks.len()).map(|at| 0.5 * (masks[at] + next(at))).collect();
+    let mut exchanged = masks.clone();
+    let (head, tail) = exchanged.split_at_mut(5 * PIXELS);
+    head[PIXELS..2 * PIXELS].swap_with_slice(&mut tail[..PIXELS]);
+    for (masks, algorithm, expected) in [
+        (&masks, "gap-tv", &["good", "usable"][..]),
+        (&drifted, "gap-tv", &["doubtful"]),
+        (&exchanged, "gap-tv", &["bad"]),
+        (&drifted, "admm-tv", &["doubtful"]),
+    ] {
+        std::fs::write(path("masks.npy"), npy(&[FRAMES, SIDE, SIDE], masks.iter().copied()))
+            .unwrap();
+        let mut submit = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        submit.arg("submit").arg(path("y.npy")).arg("--masks").arg(path("masks.npy"));
+        submit.args(["--algorithm", algorithm, "--registration", "off"]);
+        let job = printed(&app, submit, 0).await;
+        let ended = app.ended(&job).await;
+        let word = ended["verdict"].as_str().unwrap();
+        let text = ended["verdict_text"].as_str().unwrap();
+        assert!(expected.contains(&word) && text.starts_with(word), "{algorithm}: {ended:#}");
+
+        let place = format!("/v1/jobs/{job}/snapshots/0/exports/manifest");
+        let content = &app.get(&place).await.expect(200).json()["content"];
+        let whole = app.get(&format!("/v1/jobs/{job}/exports/manifest")).await.expect(200).json();
+        let snapshot = &whole["content"]["snapshots"][0];
+        assert_eq!((&content["verdict"], &snapshot["verdict"]), (&word.into(), &word.into()));
+        if algorithm == "gap-tv" {
+            assert_eq!(content["assessment"]["grade"], word);
+        }
+        let mut watch = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        watch.args(["watch", &job]);
+        let code = if word == "bad" { 3 } else { 0 };
+        let line = printed(&app, watch, code).await;
+        assert!(line.starts_with(&format!("{job}: {text}; finished")), "{line}");
+        let mut client = Command::new(&python);
+        client.args(["-c", PYTHON_VERDICT, &job]);
+        assert_eq!(printed(&app, client, 0).await, format!("{word}|{text}"));
+        let mut dashboard = Command::new("node");
+        dashboard.args(["-e", DASHBOARD_VERDICT]).arg(path("format.mjs")).arg(ended.to_string());
+        assert_eq!(printed(&app, dashboard, 0).await, word);
+        let mut matlab = Command::new("octave-cli");
+        matlab.args(["--no-init-file", "--eval", MATLAB_VERDICT]).env("JOB", &job);
+        let line = printed(&app, matlab, 0).await;
+        assert!(line.ends_with(&format!("{text}\n{word}|{text}")), "{line}");
+    }
+    // Without findings and without a quality model there is no verdict.
+    let calibration =
+        app.calibrate(npy(&[FRAMES, SIDE, SIDE], masks.into_iter())).await.expect(201);
+    let measured =
+        app.measure(&id(&calibration), npy(&[SIDE, SIDE], y.into_iter())).await.expect(201);
+    let request = json!({"measurement": id(&measured), "algorithm": "admm-tv"});
+    let ended = app.ended(&app.submit(&request).await).await;
+    let found = (&ended["verdict"], &ended["verdict_text"]);
+    assert_eq!(found, (&Value::Null, &"not assessed".into()), "{ended:#}");
 }
 
 #[test]

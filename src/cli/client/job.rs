@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::{Client, Result, refused};
 use crate::cli::CliError;
 use crate::cli::progress;
-use engine::job::{Assessment, Finding, JobState, Sha256, SnapshotRange, Timestamp};
+use engine::job::{Assessment, Finding, Grade, JobState, Sha256, SnapshotRange, Timestamp};
 
 #[derive(Debug, Clone, Deserialize)]
 pub(in crate::cli) struct Job {
@@ -24,6 +24,10 @@ pub(in crate::cli) struct Job {
     pub(in crate::cli) finished_at: Option<Timestamp>,
     /// Findings of the checks.
     pub(in crate::cli) warnings: Vec<Finding>,
+    /// The verdict on the frames. `None` if nothing was found and no quality can be predicted.
+    pub(in crate::cli) verdict: Option<Grade>,
+    /// The verdict in a line; `None` until the job has succeeded.
+    pub(in crate::cli) verdict_text: Option<String>,
     /// `None` until the job has succeeded, and if the quality can't be predicted.
     pub(in crate::cli) assessment: Option<Assessment>,
     pub(in crate::cli) snapshots: SnapshotRange,

@@ -30,11 +30,13 @@ use super::output::print_line;
 use super::submission::{Recipe, SubmissionArguments};
 use super::verdict;
 use super::wait::wait;
-use engine::job::{Assessment, Finding, JobState};
+use engine::job::JobState;
 use ledger::{Entry, Ledger, Shot, Stage};
 
 /// Extensions of files that may hold snapshots. The service detects the format by the content.
-const ENDINGS: [&str; 7] = ["npy", "tif", "tiff", "png", "mat", "h5", "hdf5"];
+const ENDINGS: [&str; 10] = ["npy", "npz", "tif", "tiff", "png", "zip", "tar", "mat", "h5", "hdf5"];
+/// Further extensions of packed pixels without a header.
+const PACKED_ENDINGS: [&str; 2] = ["raw", "bin"];
 /// File with verdict and findings, in the folder of the results.
 const REPORT: &str = "REPORT.txt";
 /// Time between two scans of the folder.
@@ -44,7 +46,7 @@ const POLL: Duration = Duration::from_millis(500);
 ///
 /// A file is submitted when it stops growing. The results are written to NAME.result in the same folder, with a
 /// REPORT.txt; if the job fails, NAME.failed.txt has the reason. The command may be stopped and started at any
-/// time. With --once it ends with 1 if a job failed or a file was skipped, and with 3 if the checks found errors in a file.
+/// time. With --once it ends with 1 if a job failed or a file was skipped, and with 3 if the verdict on a file is bad.
 #[derive(Debug, Args)]
 pub struct Arguments {
     /// The folder. Subfolders and hidden files are ignored. Links, empty files and names that are not UTF-8 are skipped and
@@ -105,10 +107,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
                 format!("{} files were skipped; the output has the reasons", watch.skipped.len());
             return Err(CliError::Failure(text));
         }
-        let results = watch.results.iter();
-        verdict::refuse_bad(
-            results.map(|(findings, assessment)| (&**findings, assessment.as_ref())),
-        )
+        verdict::refuse_bad(watch.results.iter().map(|job| (&*job.warnings, job.verdict)))
     })
 }
 
@@ -126,8 +125,8 @@ struct Watch<'a> {
     failed: usize,
     /// Names of files that are not submitted, with the reasons.
     skipped: HashMap<OsString, &'static str>,
-    /// Findings and assessments of the jobs that have ended since the start.
-    results: Vec<(Vec<Finding>, Option<Assessment>)>,
+    /// Jobs that have succeeded since the start.
+    results: Vec<Job>,
 }
 
 impl Watch<'_> {
@@ -167,7 +166,7 @@ impl Watch<'_> {
             if self.excluded.contains(&path) {
                 continue;
             }
-            let shot = match look_at(&path) {
+            let shot = match self.look_at(&path) {
                 None => continue,
                 Some(Ok(shot)) if self.ledger.has(&shot) => continue,
                 Some(Ok(shot)) => shot,
@@ -272,11 +271,11 @@ impl Watch<'_> {
                     .into(),
         }
         };
-        if shot(&path).as_ref() != Some(&entry.shot) {
+        if self.shot(&path).as_ref() != Some(&entry.shot) {
             return Ok(Some(changed()));
         }
         let data = self.client.upload_with_bar(&path).await?;
-        if shot(&path).as_ref() != Some(&entry.shot) {
+        if self.shot(&path).as_ref() != Some(&entry.shot) {
             return Ok(Some(changed()));
         }
         self.arguments.submission.send_dark(&self.client).await?;
@@ -308,7 +307,7 @@ impl Watch<'_> {
         if self.arguments.json {
             print_line(json!({
                 "file": entry.shot.name, "job": job.id,
-                "assessment": job.assessment, "findings": findings,
+                "verdict": job.verdict, "assessment": job.assessment, "findings": findings,
             }))?;
         } else {
             print_line(format!("{} {}", entry.shot.name, job.summary()))?;
@@ -319,13 +318,13 @@ impl Watch<'_> {
             "{}: {}\n\n{}\njob        {}\nalgorithm  {}\nsnapshots  {count}, from {first} on\nsubmitted  {}\n\
              finished   {end}\n",
             entry.shot.name,
-            job.verdict().unwrap_or_default(),
+            job.verdict_text.as_deref().unwrap_or_default(),
             verdict::lines(&findings).iter().map(|line| format!("{line}\n")).collect::<String>(),
             job.id,
             job.algorithm,
             job.created_at,
         );
-        self.results.push((findings, job.assessment.clone()));
+        self.results.push(job.clone());
         fs::create_dir_all(folder).map_err(|error| CliError::file("make", folder, &error))?;
         write_new(&folder.join(REPORT), &text)
     }
@@ -369,9 +368,7 @@ impl Watch<'_> {
                 (End { state, error, ..end }, failure_file(&entry.results))
             }
             Stage::Done { .. } => {
-                let last = self.results.last();
-                let verdict = last
-                    .map(|(findings, assessment)| verdict::verdict(assessment.as_ref(), findings));
+                let verdict = self.results.last().and_then(|job| job.verdict_text.clone());
                 let (state, verdict) = ("succeeded".to_owned(), verdict.unwrap_or_default());
                 (End { state, verdict, ..end }, result_folder(&entry.results))
             }
@@ -380,6 +377,41 @@ impl Watch<'_> {
         if let Err(error) = self.arguments.exec.run(&end, Some((&file, &results))).await {
             eprintln!("sci-recon: {error}");
         }
+    }
+
+    /// The state of a file that may contain snapshots, or the reason why it is never submitted. `None` for folders, hidden files
+    /// and files with other endings.
+    fn look_at(&self, path: &Path) -> Option<Result<Shot, &'static str>> {
+        let name = path.file_name()?;
+        let ending = path.extension()?.to_str()?.to_ascii_lowercase();
+        let is_packed = self.arguments.submission.is_packed();
+        let is_taken =
+            ENDINGS.contains(&&*ending) || (is_packed && PACKED_ENDINGS.contains(&&*ending));
+        if name.as_encoded_bytes().starts_with(b".") || !is_taken {
+            return None;
+        }
+        let meta = path.symlink_metadata().ok()?;
+        if meta.is_dir() {
+            return None;
+        }
+        if meta.is_symlink() {
+            return Some(Err(
+                "it is a symbolic link; put the file in the folder, or a hard link to it",
+            ));
+        }
+        if !meta.is_file() {
+            return Some(Err("it is no regular file"));
+        }
+        let Some(name) = name.to_str() else {
+            return Some(Err("the name is not UTF-8; rename the file"));
+        };
+        let time = (meta.mtime(), meta.mtime_nsec());
+        Some(Ok(Shot { name: name.to_owned(), size: meta.len(), time }))
+    }
+
+    /// The state of a regular file that may contain snapshots. `None` for all other paths.
+    fn shot(&self, path: &Path) -> Option<Shot> {
+        self.look_at(path)?.ok()
     }
 
     /// Prints why the service is unavailable, and waits.
@@ -417,35 +449,3 @@ fn failure_file(name: &str) -> String {
 }
 
 const EMPTY: &str = "the file is empty; it is submitted once it has content";
-
-/// The state of a file that may contain snapshots, or the reason why it is never submitted. `None` for folders, hidden files
-/// and files with other endings.
-fn look_at(path: &Path) -> Option<Result<Shot, &'static str>> {
-    let name = path.file_name()?;
-    let ending = path.extension()?.to_str()?.to_ascii_lowercase();
-    if name.as_encoded_bytes().starts_with(b".") || !ENDINGS.contains(&&*ending) {
-        return None;
-    }
-    let meta = path.symlink_metadata().ok()?;
-    if meta.is_dir() {
-        return None;
-    }
-    if meta.is_symlink() {
-        return Some(Err(
-            "it is a symbolic link; put the file in the folder, or a hard link to it",
-        ));
-    }
-    if !meta.is_file() {
-        return Some(Err("it is no regular file"));
-    }
-    let Some(name) = name.to_str() else {
-        return Some(Err("the name is not UTF-8; rename the file"));
-    };
-    let time = (meta.mtime(), meta.mtime_nsec());
-    Some(Ok(Shot { name: name.to_owned(), size: meta.len(), time }))
-}
-
-/// The state of a regular file that may contain snapshots. `None` for all other paths.
-fn shot(path: &Path) -> Option<Shot> {
-    look_at(path)?.ok()
-}

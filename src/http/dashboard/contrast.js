@@ -1,6 +1,6 @@
 // Contrast window of a pane: a histogram with the values shown as black and as white.
 
-import { figure } from "./format.js";
+import { inUnit } from "./format.js";
 import { h, put, s, say } from "./dom.js";
 
 const BINS = 96;
@@ -105,7 +105,7 @@ export class Contrast {
   }
 
   show() {
-    const shown = (value) => figure(value * this.factor);
+    const shown = (value) => inUnit(value, this);
     const [low, high] = [shown(this.low), shown(this.high)];
     say(this.text, `${low} to ${high}${this.words ? ` ${this.words}` : ""}`);
     this.black.setAttribute("aria-valuetext", low);

@@ -110,10 +110,17 @@ export const stateWord = (state) => (state === "succeeded" ? "finished" : state)
 /** Factor and words of the unit of pixel values: the camera's counts, or multiples of a full scale of 1. */
 export const unitOf = (fullScale) => ({ factor: fullScale, words: fullScale === 1 ? "× full scale" : "counts" });
 
+/** A pixel value times the factor of its unit. Counts keep all their digits; shares have `digits` significant ones. */
+export function inUnit(value, { factor }, digits = 3) {
+  const counts = value * factor;
+  if (factor === 1 || !Number.isFinite(counts)) return figure(value, digits);
+  return Math.abs(counts) >= 1000 ? String(Math.round(counts)) : figure(counts, Math.max(digits, 4));
+}
+
 /** A pixel value in the camera's counts, and as a multiple of the full scale. */
 export function inUnits(value, fullScale) {
   const share = `${figure(value)} × full scale`;
-  return fullScale === 1 ? share : `${figure(value * fullScale)} counts (${share})`;
+  return fullScale === 1 ? share : `${inUnit(value, unitOf(fullScale))} counts (${share})`;
 }
 
 /** Current stage of a job. */
@@ -160,28 +167,25 @@ export function findingsOf({ warnings }, assessment) {
 }
 
 /**
- * The verdict on a job's frames, as kind, word, title and reason: its findings limit the grade of its expected PSNR. The
- * list shows the word, the job's page the title and the reason.
+ * The service's verdict on frames, as kind, word, title and reason. The list shows the word, the job's page the title and the
+ * reason. `verdict` and `assessment` are those of the job or of one of its snapshots.
  */
-export function verdictOf(job, assessment = job.assessment) {
-  if (findingsOf(job, assessment).some((item) => item.severity === "error")) return ["bad", "bad", "Bad", "The checks found errors that make the frames wrong:"];
-  const likely = () => [assessment.grade, assessment.grade, `Likely ${assessment.grade}`, `${limitOf(assessment)} ${LIKE[assessment.grade]}`];
-  // A warning makes a bad result no better.
-  if (assessment?.grade === "bad" && assessment.psnr_db !== null) return likely();
-  if (job.warnings.length > 0) return ["usable", "doubtful", "Doubtful", "The checks found problems that may degrade the frames:"];
-  if (assessment?.psnr_db === null) return ["usable", "doubtful", "Doubtful", "The quality of these frames can’t be predicted:"];
-  if (assessment) return likely();
-  return ["unknown", "not judged", "Not judged", "Measurement and calibration fit each other. No quality can be predicted for this algorithm or sensor. Attach true frames, if you have them, to measure it."];
+export function verdictOf(job, { verdict, assessment } = job) {
+  if (verdict === null) return ["unknown", "not judged", "Not judged", "Measurement and calibration fit each other. No quality can be predicted for this algorithm or sensor. Attach true frames, if you have them, to measure it."];
+  const isWrong = findingsOf(job, assessment).some(({ severity }) => severity === "error");
+  if (verdict === "bad" && isWrong) return [verdict, verdict, "Bad", "The checks found errors that make the frames wrong:"];
+  if (verdict === "doubtful") return [verdict, verdict, "Doubtful", "The checks put the scale, the dark or the masks in doubt, and with them the frames:"];
+  return [verdict, verdict, `Likely ${verdict}`, `${limitOf(verdict, assessment)} ${LIKE[verdict]}`];
 }
 
 /** Expected PSNR in dB from which frames are good, and the upper end of the interval below which they are bad, as in the service. */
 const [GOOD_DB, BAD_DB] = [28, 22];
 
-/** What decided the grade of an assessment: a figure and its threshold, a finding, or one of several snapshots. */
-function limitOf({ grade, psnr_db: psnr, psnr_high_db: high, reasons }) {
-  if (grade === "good") return `The expected PSNR has reached ${GOOD_DB} dB, the threshold for “good”.`;
-  if (grade === "bad" && high < BAD_DB) return `The whole interval of the expected PSNR is below ${BAD_DB} dB, the threshold for “usable”.`;
-  if (grade === "usable" && psnr < GOOD_DB) return `The expected PSNR is below ${GOOD_DB} dB, the threshold for “good”.`;
+/** What decided a verdict without doubts: a figure and its threshold, a finding, or one of several snapshots. */
+function limitOf(verdict, { psnr_db: psnr, psnr_high_db: high, reasons }) {
+  if (verdict === "good") return `The expected PSNR has reached ${GOOD_DB} dB, the threshold for “good”.`;
+  if (verdict === "bad" && high < BAD_DB) return `The whole interval of the expected PSNR is below ${BAD_DB} dB, the threshold for “usable”.`;
+  if (verdict === "usable" && psnr < GOOD_DB) return `The expected PSNR is below ${GOOD_DB} dB, the threshold for “good”.`;
   return reasons.some(({ code }) => code !== "uneven_error") ? "The finding below limits the verdict." : "The verdict is that of the worst snapshot.";
 }
 

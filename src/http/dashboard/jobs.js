@@ -261,7 +261,7 @@ function state(cell, job, before) {
  * has not succeeded has only findings.
  */
 function verdict(cell, job, before) {
-  const same = before && before.state === job.state && before.truth === job.truth && before.warnings.length === job.warnings.length && !before.assessment === !job.assessment;
+  const same = before && before.state === job.state && before.truth === job.truth && before.warnings.length === job.warnings.length && before.verdict === job.verdict && !before.assessment === !job.assessment;
   if (same) return;
   const found = doubts(job);
   const mark = found && h("span", { class: `mark ${found.severity}`, title: found.details.join("\n") }, found.text);

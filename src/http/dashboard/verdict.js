@@ -53,7 +53,10 @@ export class Verdict {
       put(this.expected);
       return;
     }
-    this.assessment = manifest.content?.assessment;
+    const { content } = manifest;
+    this.assessment = content?.assessment ?? null;
+    // Manifests of earlier versions have no verdict.
+    this.verdict = content?.verdict === undefined ? job.verdict : content.verdict;
     this.fullScale = manifest.content?.scale.measurement_full_scale ?? 1;
     if (this.truth) await this.compare(this.truth);
     else this.unmeasured();
@@ -63,7 +66,8 @@ export class Verdict {
   showExpected() {
     const { psnr_db: psnr } = this.assessment ?? {};
     const own = findings(findingsOf(this.job, this.assessment).slice(this.job.warnings.length));
-    put(this.expected, this.assessment && (psnr === null
+    const { order_reason: order } = this.assessment ?? {};
+    put(this.expected, order && h("p", { class: "muted" }, `Order of masks not verifiable: ${order}.`), this.assessment && (psnr === null
       ? [own, h("p", { class: "muted" }, "No expected PSNR and no map of the expected error: the findings put the scale, the dark or the masks in doubt.")]
       : [h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, aboutDecibels(psnr))),
           h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`), own]));
@@ -76,7 +80,7 @@ export class Verdict {
   }
 
   unmeasured() {
-    const [kind, , title, why] = verdictOf(this.job, this.assessment ?? null);
+    const [kind, , title, why] = verdictOf(this.job, this);
     this.judge(title, kind, why);
     put(this.measured);
     this.showExpected();

@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { axisOf, figure, frameName, unitOf } from "./format.js";
+import { axisOf, frameName, inUnit, unitOf } from "./format.js";
 import { get, isUnreachable } from "./api.js";
 import { Probe } from "./probe.js";
 import { sampled } from "./values.js";
@@ -95,8 +95,8 @@ export class Viewer {
 
   /** A value in the user's units. */
   words(value) {
-    const { factor, words } = this.unit();
-    return `${value.map((one) => figure(one * factor, 4)).join(", ")} ${words}`;
+    const unit = this.unit();
+    return `${value.map((one) => inUnit(one, unit, 4)).join(", ")} ${unit.words}`;
   }
 
   /** Sets the stored number that means 1. */

@@ -2,7 +2,7 @@
 tifffile.
 
 Each holds the same numbers: masks [3, 4, 5] whose value is (frame + 2 row + 3 column) mod 2, or measurements
-[2, 4, 5] whose value is 100 frame + 10 row + column.
+[2, 4, 5] whose value is 100 frame + 10 row + column. `bench73.mat` is a recording of a small camera.
 """
 
 import pathlib
@@ -15,6 +15,28 @@ import tifffile
 from PIL import Image
 
 HERE = pathlib.Path(__file__).parent
+MATLAB_HEAD = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, of a test HDF5 schema 1.00 .".ljust(116) + b"\0" * 8 + b"\0\x02IM"
+
+
+def bench():
+    """The snapshot of a square of 0.95 that moves over a wave, in counts of 16 bits with a maximum of 61234, and the masks of
+    0 and 1, under names of somebody's own. `matlab` of tests/e2e/drive.mjs has the same formula."""
+    frame, row, column = np.indices((8, 64, 64))
+    inside = (row >= 20) & (row < 36) & (column >= 4 + 5 * frame) & (column < 20 + 5 * frame)
+    truth = np.where(inside, 0.95, 0.35 + 0.2 * np.sin(column / 9) * np.cos(row / 13))
+    masks = np.random.default_rng(1).integers(0, 2, truth.shape, np.uint8)
+    shot = (masks * truth).sum(0)
+    path = HERE / "bench73.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values, matlab in [
+            ("patterns", np.moveaxis(masks, 0, -1), "uint8"),
+            ("shots", np.rint(shot / shot.max() * 61234).astype("<u2"), "uint16"),
+        ]:
+            written = np.ascontiguousarray(values.T)
+            dataset = file.create_dataset(name, data=written, chunks=written.shape, compression="gzip", shuffle=True)
+            dataset.attrs["MATLAB_class"] = np.bytes_(matlab)
+    with path.open("r+b") as file:
+        file.write(MATLAB_HEAD)
 
 
 def main():
@@ -42,7 +64,8 @@ def main():
             dataset = file.create_dataset(name, data=written, chunks=written.shape, compression="gzip")
             dataset.attrs["MATLAB_class"] = np.bytes_(matlab)
     with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64, of a test HDF5 schema 1.00 .".ljust(116) + b"\0" * 8 + b"\0\x02IM")
+        file.write(MATLAB_HEAD)
+    bench()
     for name, type in [("int64", "<i8"), ("int32-big", ">i4"), ("float16", "<f2"), ("int8", "i1")]:
         np.save(HERE / f"masks-{name}.npy", masks.astype(type))
     Image.fromarray(masks[0].astype(bool)).save(HERE / "mask-1-bit.png")

@@ -6,6 +6,7 @@ import argparse
 import inspect
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,59 @@ from ._watch import FILES, Watch, submitter
 # Keywords of `Client.reconstruct` that are not options of the command.
 OTHERS = {"self", "masks", "measurement", "folder", "key"}
 TYPES = {"float": float, "int": int}
+# Options that name files which belong to every snapshot.
+OWN = ("masks", "bad_pixels", "truth")
+
+
+def whole_numbers(text: str, separator: str, form: str) -> list[int]:
+    """Whole numbers from 0, one for each name of the form."""
+    parts = text.split(separator)
+    if len(parts) != form.count(separator) + 1 or not all(part.strip().isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r}; give {form} in whole numbers from 0")
+    return [int(part) for part in parts]
+
+
+def crop(text: str) -> dict[str, int]:
+    values = whole_numbers(text, ",", "ROW,COLUMN,HEIGHT,WIDTH")
+    return dict(zip(("row", "column", "height", "width"), values, strict=True))
+
+
+def frames(text: str) -> tuple[int, int]:
+    first, last = whole_numbers(text, "-", "FIRST-LAST")
+    return first, last
+
+
+def registration(text: str) -> str | dict[str, Any]:
+    if text in ("auto", "off"):
+        return text
+    try:
+        rows, columns, *more = [float(number) for number in text.split(",")]
+        rotation, scale = [*more, *(0.0, 1.0)[len(more):]]
+    except ValueError:
+        form = "off, auto, or ROWS,COLUMNS[,DEGREES[,SCALE]], such as 0.5,-1.2 for a shift in pixels"
+        raise argparse.ArgumentTypeError(f"{text!r}; give {form}") from None
+    return {"shift": (rows, columns), "rotation": rotation, "scale": scale}
+
+
+def json_file(path: str) -> dict[str, Any]:
+    try:
+        value = json.loads(Path(path).read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise argparse.ArgumentTypeError(f"{path}: {error}") from None
+    if not isinstance(value, dict):
+        raise argparse.ArgumentTypeError(f"{path} has no JSON object")
+    return value
+
+
+# Parsers of the keywords that are no single text or number, with their placeholders and help.
+PARSERS: dict[str, tuple[Callable[[str], Any], str, str]] = {
+    "crop": (crop, "ROW,COLUMN,HEIGHT,WIDTH", "window of the snapshots"),
+    "masks_crop": (crop, "ROW,COLUMN,HEIGHT,WIDTH", "window of the masks"),
+    "masks_frames": (frames, "FIRST-LAST", "the masks to use, counted from 0"),
+    "dispersion": (json_file, "FILE", "JSON with axis, offsets, wavelengths and mask of a spectral camera"),
+    "schedule": (json_file, "FILE", "a schedule as JSON"),
+    "registration": (registration, "WHICH", "off, auto, or ROWS,COLUMNS[,DEGREES[,SCALE]] of masks that have moved"),
+}
 
 
 def parser() -> argparse.ArgumentParser:
@@ -38,8 +92,9 @@ def parser() -> argparse.ArgumentParser:
         option = "--" + name.replace("_", "-")
         if name == "dark":
             watch.add_argument(option, action="append", metavar="FILE", help="dark capture; may be repeated")
-        elif name == "schedule":
-            watch.add_argument(option, type=lambda path: json.loads(Path(path).read_text("utf-8")), metavar="FILE")
+        elif name in PARSERS:
+            parse, metavar, text = PARSERS[name]
+            watch.add_argument(option, type=parse, metavar=metavar, help=text)
         elif name == "tile":
             watch.add_argument(option, type=int, nargs=2, metavar=("SIZE", "OVERLAP"), help="in pixels")
         elif name == "snapshots":
@@ -62,18 +117,19 @@ def options(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def main(line: list[str] | None = None) -> int:
-    """Returns the exit status: 1 if files failed, 3 if the checks found errors, as `sci-recon watch-folder` does."""
+    """Returns the exit status: 1 if files failed, 3 if a verdict is bad, as `sci-recon watch-folder` does."""
     arguments = parser().parse_args(line)
     with Client(arguments.url, arguments.token) as client:
         submit = submitter(client, arguments.masks, options(vars(arguments)))
-        own = [arguments.masks, *(arguments.dark or [])]
+        own = [file for name in OWN if (file := getattr(arguments, name))] + (arguments.dark or [])
         files = arguments.file or FILES
-        watch = Watch(client, arguments.folder, submit, files=files, own=own, settle_seconds=arguments.settle_seconds)
+        settle, packed = arguments.settle_seconds, arguments.packing is not None
+        watch = Watch(client, arguments.folder, submit, files=files, own=own, settle_seconds=settle, packed=packed)
         watch.run(arguments.once)
     if watch.failed:
         print(f"{watch.failed} files have failed; see their .failed.txt", file=sys.stderr)
         return 1
-    return 3 if watch.doubtful else 0
+    return 3 if watch.bad else 0
 
 
 if __name__ == "__main__":

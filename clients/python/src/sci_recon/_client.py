@@ -29,8 +29,6 @@ from ._transfer import Source
 Record = dict[str, Any]
 Snapshots = Literal["all"] | int | tuple[int, int]
 ENDED = {"succeeded", "failed", "cancelled"}
-# Expected PSNR in dB from which frames are good, and the upper end of the interval below which they are bad, as in the service.
-GOOD_DB, BAD_DB = 28, 22
 # Side of the blocks of error.npy in pixels.
 BLOCK = 16
 # Files that the service composes on demand, and their exports.
@@ -517,23 +515,9 @@ class Job(Entity):
 
     @property
     def verdict(self) -> str:
-        """The grade of the frames, and the expected PSNR if it can be predicted."""
-        if assessment := self.record.get("assessment"):
-            grade, psnr, low, high = (assessment[key] for key in ("grade", "psnr_db", "psnr_low_db", "psnr_high_db"))
-            if psnr is None:
-                text = f"{grade}, no expected PSNR"
-            elif psnr < 40:
-                text = f"{grade}, expected PSNR {psnr:.1f} dB ({low:.1f} to {high:.1f})"
-            else:
-                text = f"{grade}, expected PSNR 40 dB or more" + (f" ({low:.1f} or more)" if low < 40 else "")
-            if grade == "usable" and psnr is not None and psnr < GOOD_DB:
-                text += f"; good from {GOOD_DB} dB"
-            if grade == "bad" and high is not None and high < BAD_DB:
-                text += f"; usable if the interval reaches {BAD_DB} dB"
-            if assessment.get("order") == "not_verifiable":
-                text += "; order of masks not verifiable: the scene moves too little or too fast"
-            return text
-        return "bad" if any(finding["severity"] == "error" for finding in self.findings) else "not assessed"
+        """The service's verdict on the frames in a line, with the expected PSNR if it can be predicted. `record["verdict"]`
+        has the word alone. The text is empty until the job has succeeded."""
+        return self.record.get("verdict_text") or ""
 
     @property
     def state(self) -> str:
@@ -634,7 +618,7 @@ class Result:
         findings = "".join(f"<li>{html.escape(line)}</li>" for line in describe_all(self.job.findings))
         text = f"<p>{html.escape(repr(self))}</p>" + (f"<ul>{findings}</ul>" if findings else "")
         try:
-            picture = preview(self.snapshot(self.snapshots[0]))
+            picture = preview(self.snapshot(self.snapshots[0]), self.white_level)
         except ImportError:
             return text
         return f'{text}<img alt="frames" src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
@@ -721,10 +705,15 @@ class Result:
             self._exported.add(path)
         return path
 
-    @property
+    @cached_property
     def manifest(self) -> Record:
         """The manifest of the job: inputs, parameters and results."""
         return self.job.client._get(f"/v1/jobs/{self.job.id}/exports/manifest")
+
+    @property
+    def white_level(self) -> float:
+        """The value that pictures show as white: the 99.9th percentile of all frames of the job."""
+        return white_level_of(self.manifest)
 
 
 def read_manifest(manifest: Record | str | os.PathLike[str]) -> Record:
@@ -733,6 +722,11 @@ def read_manifest(manifest: Record | str | os.PathLike[str]) -> Record:
     if whole.get("schema") != "sci-recon/job/1" or "request" not in whole["content"]:
         raise ValueError("this is not the manifest.json of a job, or an earlier version has written it")
     return whole
+
+
+def white_level_of(manifest: Record) -> float:
+    """The white level of a manifest, and 1 for black frames."""
+    return float(manifest["content"]["scale"]["white_level"]) or 1.0
 
 
 def frames_of(manifest: Record) -> dict[int, str]:
@@ -771,24 +765,17 @@ def describe(finding: Record, snapshots: Sequence[int]) -> str:
     return f"{finding['severity']} {finding['code']}: {place}{detail}. Remedy: {remedy}."
 
 
-def preview(frames: npt.NDArray[np.float32], side: int = 256) -> bytes:
-    """An animated PNG of frames [B, H, W] or [B, H, W, 3]: ten frames per second, displayed from 0 to the white level. The
+def preview(frames: npt.NDArray[np.float32], white: float, side: int = 256) -> bytes:
+    """An animated PNG of frames [B, H, W] or [B, H, W, 3]: ten frames per second, displayed from 0 to `white`. The
     longer side is reduced to about `side` pixels."""
     from PIL import Image
 
     step = max(1, round(max(frames.shape[1:3]) / side))
-    small, white = frames[:, ::step, ::step], white_level(frames)
+    small = frames[:, ::step, ::step]
     pictures = [Image.fromarray(np.uint8(np.clip(frame / white, 0, 1) * 255)) for frame in small]
     file = io.BytesIO()
     pictures[0].save(file, "PNG", save_all=True, append_images=pictures[1:], duration=100, loop=0)
     return file.getvalue()
-
-
-def white_level(frames: npt.NDArray[np.float32]) -> float:
-    """The 99.9th percentile of frames [B, H, W] or [B, H, W, 3], and 1 for black frames. Large frames are subsampled."""
-    step = max(1, int((frames.size / 4e6) ** 0.5))
-    level = float(np.percentile(frames[:, ::step, ::step], 99.9))
-    return level if level > 0 else 1.0
 
 
 class Bar:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ._client import Client, white_level
+from ._client import Client, white_level_of
 
 # A layer of napari: data, keywords of the layer, and kind.
 Layer = tuple[Any, dict[str, Any], str]
@@ -44,7 +44,8 @@ def read_job(path: str) -> list[Layer]:
     job = Client(address["url"]).job(address["job"])
     # The frames are mapped from a temporary file. The layer keeps a reference to the result, so that the file stays.
     result = job.result()
-    return [layer(result.frames, job.record.get("label") or job.id, {"verdict": job.verdict, "result": result})]
+    name, metadata = job.record.get("label") or job.id, {"verdict": job.verdict, "result": result}
+    return [layer(result.frames, name, result.white_level, metadata)]
 
 
 def read_folder(path: str) -> list[Layer]:
@@ -52,15 +53,15 @@ def read_folder(path: str) -> list[Layer]:
     folder = Path(path)
     manifest = json.loads((folder / "manifest.json").read_text("utf-8"))
     frames = np.load(folder / "frames.npy", mmap_mode="r")
-    return [layer(frames, folder.name, {"manifest": manifest})]
+    return [layer(frames, folder.name, white_level_of(manifest), {"manifest": manifest})]
 
 
-def layer(frames: npt.NDArray[np.float32], name: str, metadata: dict[str, Any]) -> Layer:
-    """A layer of frames [B, H, W] or [B, H, W, 3], shown from 0 to the white level."""
+def layer(frames: npt.NDArray[np.float32], name: str, white: float, metadata: dict[str, Any]) -> Layer:
+    """A layer of frames [B, H, W] or [B, H, W, 3], shown from 0 to the white level of their job."""
     settings = {
         "name": name,
         "rgb": frames.ndim == 4,
-        "contrast_limits": (0.0, white_level(frames)),
+        "contrast_limits": (0.0, white),
         "metadata": metadata,
     }
     return (frames, settings, "image")

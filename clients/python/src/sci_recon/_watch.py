@@ -20,7 +20,9 @@ from typing import Any
 from ._client import Client, Job, Result, describe_all
 from ._errors import ApiError, JobFailed, SciReconError
 
-ENDINGS = {".npy", ".tif", ".tiff", ".png", ".mat", ".h5", ".hdf5"}
+ENDINGS = {".npy", ".npz", ".tif", ".tiff", ".png", ".zip", ".tar", ".mat", ".h5", ".hdf5"}
+# Further endings of packed pixels without a header.
+PACKED_ENDINGS = {".raw", ".bin"}
 LEDGER = ".sci-recon-watch.json"
 # The ledger of `sci-recon watch-folder`.
 OTHER_LEDGER = ".sci-recon.ledger"
@@ -34,7 +36,8 @@ Submit = Callable[[Path, str], Job]
 class Watch:
     """Watches `folder`. `submit` creates a job from file NAME. Its result `files` and a REPORT.txt are saved in NAME.result.
 
-    If the job fails, NAME.failed.txt has the reason. Files in `own`, such as masks, are not submitted.
+    If the job fails, NAME.failed.txt has the reason. Files in `own`, such as masks, are not submitted. With `packed`, files
+    of packed pixels without a header are submitted, too.
     """
 
     def __init__(
@@ -46,15 +49,17 @@ class Watch:
         files: Sequence[str] = FILES,
         own: Sequence[str | os.PathLike[str]] = (),
         settle_seconds: float = 3.0,
+        packed: bool = False,
     ) -> None:
         self.client = client
         self.folder = Path(folder)
         self.submit = submit
         self.files = files
+        self.endings = ENDINGS | PACKED_ENDINGS if packed else ENDINGS
         self.own = {Path(file).resolve() for file in own}
         self.settle_seconds = settle_seconds
         self.failed = 0
-        self.doubtful = 0
+        self.bad = 0
         if (self.folder / OTHER_LEDGER).exists():
             raise SciReconError(
                 f"{self.folder} is watched by `sci-recon watch-folder`: use one of both, or remove {OTHER_LEDGER}"
@@ -66,8 +71,8 @@ class Watch:
         self.settling: dict[str, float] = {}
 
     def run(self, once: bool = False) -> None:
-        """Watches until it is interrupted. With `once` it returns when all files are processed; `failed` and `doubtful` are
-        the numbers of files that failed, and of those with errors found by the checks."""
+        """Watches until it is interrupted. With `once` it returns when all files are processed; `failed` and `bad` are
+        the numbers of files that failed, and of those with a bad verdict."""
         while True:
             self.look()
             if once and not self.jobs and not self.settling:
@@ -109,7 +114,7 @@ class Watch:
 
     def _key(self, path: Path) -> str | None:
         """The key of a file and its present content. Paths that are not files of snapshots have no key."""
-        if path.name.startswith(".") or path.suffix.lower() not in ENDINGS or path.is_symlink() or not path.is_file():
+        if path.name.startswith(".") or path.suffix.lower() not in self.endings or path.is_symlink() or not path.is_file():
             return None
         try:
             meta = path.stat()
@@ -138,7 +143,7 @@ class Watch:
         print(f"{path.name} is in {folder.name}: {job.verdict}", flush=True)
         for line in findings:
             print(f"    {line}", flush=True)
-        self.doubtful += any(finding["severity"] == "error" for finding in job.findings)
+        self.bad += job.record.get("verdict") == "bad"
         self._record(key, folder.name)
 
     def _fail(self, key: str, path: Path, error: Exception) -> None:

@@ -51,7 +51,7 @@ pub fn report_page(title: &str, report: &CalibrationReport) -> String {
 fn grade(report: &CalibrationReport) -> Markup {
     let (class, text) = match report.grade {
         Grade::Good => ("good", "Good: no fault was found in the masks alone."),
-        Grade::Usable => ("warn", "Usable, with these limitations:"),
+        Grade::Usable | Grade::Doubtful => ("warn", "Usable, with these limitations:"),
         Grade::Bad => ("trouble", "Bad: frames reconstructed with it will be wrong."),
     };
     html! {

@@ -1,4 +1,4 @@
-//! The predicted quality of frames without ground truth.
+//! The predicted quality of frames without ground truth, and the verdict on them.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,6 +18,9 @@ pub struct Assessment {
     /// Order of the masks, as far as the motion of the scene shows it; `None` without a test.
     #[serde(default)]
     pub order: Option<MaskOrder>,
+    /// Why the scene or the masks do not show the order; `None` unless `order` is `not_verifiable`.
+    #[serde(default)]
+    pub order_reason: Option<String>,
     /// Findings that limit the quality or the reliability of the prediction.
     pub reasons: Vec<Finding>,
 }
@@ -29,7 +32,7 @@ pub struct Assessment {
 pub enum MaskOrder {
     /// The frames follow one another more steadily than with any two masks exchanged. The reversed order looks the same.
     Consistent,
-    /// The scene does not show the order.
+    /// The frames do not show the order; `order_reason` says why.
     NotVerifiable,
     /// With two masks exchanged the frames would follow one another much more steadily.
     Doubtful,
@@ -57,18 +60,141 @@ impl Assessment {
                 reasons.push(reason.clone());
             }
         }
+        let order = all.iter().filter_map(|one| one.order).max();
         Some(Self {
             grade: all.iter().map(|one| one.grade).max()?,
             psnr_db: mean(|one| one.psnr_db),
             psnr_low_db: mean(|one| one.psnr_low_db),
             psnr_high_db: mean(|one| one.psnr_high_db),
-            order: all.iter().filter_map(|one| one.order).max(),
+            order,
+            order_reason: all
+                .iter()
+                .filter(|one| one.order == order)
+                .find_map(|one| one.order_reason.clone()),
             reasons,
         })
+    }
+
+    /// The findings of the checks, and those reasons of an assessment that have other codes.
+    pub fn findings(checks: &[Finding], assessment: Option<&Self>) -> Vec<Finding> {
+        let mut findings = checks.to_vec();
+        for reason in assessment.iter().flat_map(|assessment| &assessment.reasons) {
+            if checks.iter().all(|known| known.code != reason.code) {
+                findings.push(reason.clone());
+            }
+        }
+        findings
+    }
+
+    /// The verdict on frames: the grade of their assessment, or what the findings decide alone. `None` if nothing was found
+    /// and no quality can be predicted.
+    pub fn verdict(checks: &[Finding], assessment: Option<&Self>) -> Option<Grade> {
+        let by_doubts = Grade::by_doubts(&Self::findings(checks, assessment));
+        by_doubts.max(assessment.map(|assessment| assessment.grade))
+    }
+
+    /// The verdict in a line: its word, the expected PSNR if it can be predicted, the threshold that it missed, and why the
+    /// order of the masks was not verified.
+    pub fn verdict_text(verdict: Option<Grade>, assessment: Option<&Self>) -> String {
+        let word = verdict.map_or("not assessed", |grade| grade.into_str());
+        let Some(assessment) = assessment else { return word.to_owned() };
+        let Self { psnr_db, psnr_low_db, psnr_high_db, order_reason, .. } = assessment;
+        let best = Self::MAX_PSNR_DB;
+        let mut text = match (psnr_db, psnr_low_db, psnr_high_db) {
+            (Some(psnr), Some(low), Some(high)) if *psnr < best => {
+                format!("{word}, expected PSNR {psnr:.1} dB ({low:.1} to {high:.1})")
+            }
+            (Some(_), Some(low), _) if *low < best => {
+                format!("{word}, expected PSNR {best:.0} dB or more ({low:.1} or more)")
+            }
+            (Some(_), ..) => format!("{word}, expected PSNR {best:.0} dB or more"),
+            (None, ..) => format!("{word}, no expected PSNR"),
+        };
+        let (good, usable) = (Self::GOOD_DB, Self::BAD_DB);
+        match verdict {
+            Some(Grade::Usable) if psnr_db.is_some_and(|psnr| psnr < good) => {
+                text += &format!("; good from {good:.0} dB");
+            }
+            Some(Grade::Bad) if psnr_high_db.is_some_and(|high| high < usable) => {
+                text += &format!("; usable if the interval reaches {usable:.0} dB");
+            }
+            _ => {}
+        }
+        if let Some(reason) = order_reason {
+            text += &format!("; order of masks not verifiable: {reason}");
+        }
+        text
     }
 
     /// Rounds to tenths of a decibel, the precision of the prediction.
     pub fn round(decibels: f64) -> f64 {
         (decibels * 10.0).round() / 10.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Assessment, Finding, Grade, MaskOrder};
+    use crate::job::{FindingCode, Severity};
+
+    const GRADED: Assessment = Assessment {
+        grade: Grade::Usable,
+        psnr_db: Some(31.24),
+        psnr_low_db: Some(29.8),
+        psnr_high_db: Some(32.9),
+        order: None,
+        order_reason: None,
+        reasons: Vec::new(),
+    };
+
+    #[test]
+    fn a_verdict_has_the_grade_and_the_expected_psnr() {
+        let text = |one: &Assessment| Assessment::verdict_text(Some(one.grade), Some(one));
+        assert_eq!(text(&GRADED), "usable, expected PSNR 31.2 dB (29.8 to 32.9)");
+        let unordered = Assessment {
+            order: Some(MaskOrder::NotVerifiable),
+            order_reason: Some("the scene moves too little".into()),
+            ..GRADED
+        };
+        let line = text(&unordered);
+        assert!(
+            line.ends_with("; order of masks not verifiable: the scene moves too little"),
+            "{line}"
+        );
+        let at = |grade, psnr, low, high| Assessment {
+            grade,
+            psnr_db: Some(psnr),
+            psnr_low_db: Some(low),
+            psnr_high_db: Some(high),
+            ..GRADED
+        };
+        let line = text(&at(Grade::Good, 40.0, 38.2, 40.0));
+        assert_eq!(line, "good, expected PSNR 40 dB or more (38.2 or more)");
+        let line = text(&at(Grade::Good, 40.0, 40.0, 40.0));
+        assert_eq!(line, "good, expected PSNR 40 dB or more");
+        let withheld = Assessment { grade: Grade::Doubtful, psnr_db: None, ..GRADED };
+        assert_eq!(text(&withheld), "doubtful, no expected PSNR");
+        let line = text(&at(Grade::Usable, 24.1, 21.1, 26.0));
+        assert_eq!(line, "usable, expected PSNR 24.1 dB (21.1 to 26.0); good from 28 dB");
+        let line = text(&at(Grade::Bad, 18.0, 15.0, 20.0));
+        assert!(line.ends_with("; usable if the interval reaches 22 dB"), "{line}");
+        assert_eq!(Assessment::verdict_text(None, None), "not assessed");
+        assert_eq!(Assessment::verdict_text(Some(Grade::Bad), None), "bad");
+    }
+
+    /// Algorithms without a quality model get the verdict of their findings.
+    #[test]
+    fn findings_decide_without_a_quality_model() {
+        let finding = |code, severity| Finding { severity, ..Finding::new(code, "") };
+        let verdict = |code, severity| Assessment::verdict(&[finding(code, severity)], None);
+        let (warning, error) = (Severity::Warning, Severity::Error);
+        assert_eq!(verdict(FindingCode::DriftedMasks, warning), Some(Grade::Doubtful));
+        assert_eq!(verdict(FindingCode::LeftAligned, warning), Some(Grade::Doubtful));
+        assert_eq!(verdict(FindingCode::NoDark, error), Some(Grade::Bad));
+        assert_eq!(verdict(FindingCode::BadPixels, warning), None);
+        assert_eq!(Assessment::verdict(&[], None), None);
+        // A check that the assessment does not know lowers its grade.
+        let doubt = [finding(FindingCode::NoDark, warning)];
+        assert_eq!(Assessment::verdict(&doubt, Some(&GRADED)), Some(Grade::Doubtful));
     }
 }

@@ -39,6 +39,7 @@ pub use registration::{Registered, RegistrationRequest};
 pub use repetition::repetition;
 pub use report::{
     CalibrationReport, CaptureReport, Finding, FindingCode, Grade, MaskReport, Severity,
+    withholds_quality,
 };
 pub use request::{JobRequest, JobSpec, MAX_TASKS, SnapshotSelection, priority_error};
 pub use shape::{Cut, CutRequest, RunSpec, SceneShape, Sequence, SnapshotRange, TileSpec};

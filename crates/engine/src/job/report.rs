@@ -60,11 +60,23 @@ pub enum Grade {
     Good,
     /// Usable, with the limitations that the warnings state.
     Usable,
+    /// A finding questions the scale, the dark or the masks. Reports on calibrations have no such grade.
+    Doubtful,
     /// Results are wrong.
     Bad,
 }
 
 impl Grade {
+    /// The verdict that findings on a result decide alone: bad after an error, doubtful if the scale, the dark or the masks
+    /// are questioned. `None` if its quality decides.
+    pub fn by_doubts(findings: &[Finding]) -> Option<Self> {
+        if findings.iter().any(|finding| finding.severity == Severity::Error) {
+            return Some(Self::Bad);
+        }
+        let is_doubtful = withholds_quality(findings) || questions_scale(findings);
+        is_doubtful.then_some(Self::Doubtful)
+    }
+
     /// The grade that follows from the worst finding.
     pub fn of(findings: &[Finding]) -> Self {
         match findings.iter().map(|finding| finding.severity).max() {
@@ -73,6 +85,54 @@ impl Grade {
             Some(Severity::Error) => Self::Bad,
         }
     }
+}
+
+/// True if a finding says that the scale of the masks, the dark, or the masks themselves may be wrong. The quality model
+/// knows only results with the right ones.
+pub fn withholds_quality(findings: &[Finding]) -> bool {
+    use FindingCode::{
+        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
+        InvertedMasks, MaskScale, MaskValues, MisplacedMasks, MissingMask, MissingPattern, Mosaic,
+        Negative, NegativeOffset, NoDark, ResampledMasks, ShiftedMasks, TurnedMasks,
+        UnexplainedPixels, WrongDark,
+    };
+    const DOUBTS: [FindingCode; 20] = [
+        BadCalibration,
+        BinaryMeasurement,
+        DriftedMasks,
+        ExchangedMasks,
+        ForeignMasks,
+        InvertedMasks,
+        MaskScale,
+        MaskValues,
+        MisplacedMasks,
+        MissingMask,
+        MissingPattern,
+        Mosaic,
+        Negative,
+        NegativeOffset,
+        NoDark,
+        ResampledMasks,
+        ShiftedMasks,
+        TurnedMasks,
+        UnexplainedPixels,
+        WrongDark,
+    ];
+    // The quality model does not count pixels that were not measured.
+    let lacks_pixels = |finding: &Finding| {
+        finding.severity == Severity::Error
+            && (finding.is(FindingCode::Saturated) || finding.is(FindingCode::BadPixels))
+    };
+    findings
+        .iter()
+        .any(|finding| lacks_pixels(finding) || DOUBTS.iter().any(|code| finding.is(*code)))
+}
+
+/// True if a finding questions the full scale of the measurement. The expected PSNR is relative to the white level, so it
+/// does not depend on that scale.
+fn questions_scale(findings: &[Finding]) -> bool {
+    use FindingCode::{LeftAligned, Level, RightAligned};
+    findings.iter().any(|finding| [Level, LeftAligned, RightAligned].iter().any(|c| finding.is(*c)))
 }
 
 /// The report on a calibration.

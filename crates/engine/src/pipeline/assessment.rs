@@ -4,7 +4,7 @@
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
-use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, Severity};
+use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, withholds_quality};
 pub use reconstruction::assessment::{BLOCK, blocks};
 use reconstruction::assessment::{Evidence, Model, unfamiliar_masks};
 use reconstruction::hold_out::Prediction;
@@ -190,7 +190,7 @@ pub fn expected(
     reasons.sort_by_key(|reason| {
         (reason.is(FindingCode::UnevenError), !reason.is(FindingCode::MaskValues))
     });
-    let withheld = is_in_doubt(&reasons);
+    let withheld = withholds_quality(&reasons);
     // This finding states the figures that are withheld.
     reasons.retain(|reason| !(withheld && reason.is(FindingCode::UnevenError)));
     let stated = |decibels| (!withheld).then(|| Assessment::round(decibels));
@@ -200,44 +200,10 @@ pub fn expected(
         psnr_low_db: stated(low),
         psnr_high_db: stated(high),
         order: common_order(&orders),
+        order_reason: unverifiable_order(&orders, motion).map(str::to_owned),
         reasons,
     };
     Some(Expected { assessment, error })
-}
-
-/// True if a finding says that the scale of the masks, the dark, or the masks themselves may be wrong. The quality model
-/// knows only results with the right ones.
-fn is_in_doubt(findings: &[Finding]) -> bool {
-    const DOUBTS: [FindingCode; 20] = [
-        FindingCode::BadCalibration,
-        FindingCode::BinaryMeasurement,
-        FindingCode::DriftedMasks,
-        FindingCode::ExchangedMasks,
-        FindingCode::ForeignMasks,
-        FindingCode::InvertedMasks,
-        FindingCode::MaskScale,
-        FindingCode::MaskValues,
-        FindingCode::MisplacedMasks,
-        FindingCode::MissingMask,
-        FindingCode::MissingPattern,
-        FindingCode::Mosaic,
-        FindingCode::Negative,
-        FindingCode::NegativeOffset,
-        FindingCode::NoDark,
-        FindingCode::ResampledMasks,
-        FindingCode::ShiftedMasks,
-        FindingCode::TurnedMasks,
-        FindingCode::UnexplainedPixels,
-        FindingCode::WrongDark,
-    ];
-    // The quality model does not count pixels that were not measured.
-    let lacks_pixels = |finding: &Finding| {
-        finding.severity == Severity::Error
-            && (finding.is(FindingCode::Saturated) || finding.is(FindingCode::BadPixels))
-    };
-    findings
-        .iter()
-        .any(|finding| lacks_pixels(finding) || DOUBTS.iter().any(|code| finding.is(*code)))
 }
 
 /// The order by the majority of the tiles that show it; `None` if there is no test.
@@ -251,6 +217,19 @@ fn common_order(orders: &[Order]) -> Option<MaskOrder> {
         _ if exchanged > consistent => Some(MaskOrder::Doubtful),
         _ => Some(MaskOrder::Consistent),
     }
+}
+
+/// The reason why the order of the masks can't be verified; `None` if it can. `motion` is in pixels per frame.
+fn unverifiable_order(orders: &[Order], motion: f32) -> Option<&'static str> {
+    (common_order(orders) == Some(MaskOrder::NotVerifiable)).then(|| {
+        if orders.contains(&Order::SimilarMasks) {
+            "the masks resemble one another, and so do their frames in any order"
+        } else if motion > FAST_MOTION {
+            "the scene moves too fast"
+        } else {
+            "the scene moves too little"
+        }
+    })
 }
 
 /// Reports frames that follow one another much more steadily after an exchange.
@@ -286,23 +265,19 @@ fn unexplained_pixels(predictions: &[Prediction]) -> Option<Finding> {
     })
 }
 
-/// The grade of the expected PSNR, limited by the findings. Frames are graded bad only if the whole interval is below
+/// The grade by the findings, or else by the expected PSNR, limited by warnings. Frames are graded bad only if the whole interval is below
 /// [`Assessment::BAD_DB`], so that usable pictures are not discarded.
 fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
+    if let Some(grade) = Grade::by_doubts(reasons) {
+        return grade;
+    }
     let expected = match psnr_db {
         Assessment::GOOD_DB.. => Grade::Good,
         _ if high >= Assessment::BAD_DB => Grade::Usable,
         _ => Grade::Bad,
     };
-    let severities = reasons
-        .iter()
-        .filter(|reason| !reason.is(FindingCode::UnevenError))
-        .map(|reason| reason.severity);
-    match severities.max() {
-        Some(Severity::Error) => Grade::Bad,
-        Some(Severity::Warning) if expected == Grade::Good => Grade::Usable,
-        _ => expected,
-    }
+    let is_limited = reasons.iter().any(|reason| !reason.is(FindingCode::UnevenError));
+    if is_limited { expected.max(Grade::Usable) } else { expected }
 }
 
 /// A part of the picture is reported if its PSNR is this much below that of the whole picture, in dB.
@@ -368,14 +343,15 @@ const PARTS: [[&str; 3]; 3] = [
 
 #[cfg(test)]
 mod tests {
-    use super::{DARK, Prediction, TileAssessment, expected, grade};
+    use super::{DARK, Prediction, TileAssessment, expected, grade, unverifiable_order};
     use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
+    use reconstruction::order::Order;
     use reconstruction::schedule::Schedule;
     use reconstruction::sequence::SequencePlan;
     use reconstruction::tile::TilePlan;
 
     fn finding(severity: Severity) -> Finding {
-        Finding { severity, ..Finding::new(FindingCode::Level, "") }
+        Finding { severity, ..Finding::new(FindingCode::Saturated, "") }
     }
 
     #[test]
@@ -415,6 +391,26 @@ mod tests {
         assert_eq!(grade_of(30.0, &[finding(Severity::Warning)]), Grade::Usable);
         assert_eq!(grade_of(20.0, &[finding(Severity::Warning)]), Grade::Bad);
         assert_eq!(grade_of(30.0, &[finding(Severity::Error)]), Grade::Bad);
+        // The figure is withheld, or its scale questioned, so it does not decide the grade.
+        for code in [FindingCode::DriftedMasks, FindingCode::NoDark, FindingCode::Level] {
+            let doubt = Finding { severity: Severity::Warning, ..Finding::new(code, "") };
+            for psnr in [12.0, 25.0, 35.0] {
+                assert_eq!(grade_of(psnr, std::slice::from_ref(&doubt)), Grade::Doubtful);
+            }
+        }
+        let uneven = [Finding::new(FindingCode::UnevenError, "")];
+        assert_eq!(grade_of(30.0, &uneven), Grade::Good);
+    }
+
+    #[test]
+    fn an_order_that_can_t_be_verified_has_a_reason() {
+        let still = [Order::NotVerifiable; 2];
+        assert_eq!(unverifiable_order(&still, 0.2), Some("the scene moves too little"));
+        assert_eq!(unverifiable_order(&still, 9.0), Some("the scene moves too fast"));
+        let similar = unverifiable_order(&[Order::SimilarMasks; 2], 0.2);
+        assert!(similar.unwrap().starts_with("the masks resemble"), "{similar:?}");
+        assert_eq!(unverifiable_order(&[Order::NotVerifiable, Order::Consistent], 1.0), None);
+        assert_eq!(unverifiable_order(&[], 1.0), None);
     }
 
     #[test]
@@ -502,6 +498,7 @@ mod tests {
             psnr_low_db: Some(psnr_db - 3.0),
             psnr_high_db: Some(psnr_db + 3.0),
             order: None,
+            order_reason: None,
             reasons: reasons.to_vec(),
         };
         let warned = [finding(Severity::Warning)];

@@ -12,9 +12,9 @@ use serde_json::{Map, Value};
 use super::assessment::{BLOCK, Expected, TileAssessment, expected};
 use super::records::{CostRecord, PilotRecord, RunRecord, SnapshotRecord, TileRecord};
 use crate::job::{
-    Algorithm, Assessment, CalibrationId, Dispersion, Finding, Inputs, JobId, JobSpec, Label,
-    MeasurementId, ModelId, ModelRecord, Mosaic, Registered, ResultFile, SceneShape, Schedule,
-    Sha256, TaskKind, repetition,
+    Algorithm, Assessment, CalibrationId, Dispersion, Finding, Grade, Inputs, JobId, JobSpec,
+    Label, MeasurementId, ModelId, ModelRecord, Mosaic, Registered, ResultFile, SceneShape,
+    Schedule, Sha256, TaskKind, repetition,
 };
 use formats::exr::Attributes;
 use reconstruction::sequence::{RunShare, SequencePlan};
@@ -156,6 +156,7 @@ impl Recipe {
             None => CameraRecord::new(self.camera, snapshot, frames),
         };
         let recipe = Self { warnings: self.warnings_of(snapshot), ..self.clone() };
+        let verdict = Assessment::verdict(&recipe.warnings, assessment.as_ref());
         let content = Content {
             camera,
             recipe,
@@ -164,6 +165,7 @@ impl Recipe {
             width,
             snapshot,
             summary: TileRecord::summary(&tiles),
+            verdict,
             assessment,
             tiles,
             files: Vec::new(),
@@ -183,7 +185,9 @@ impl Recipe {
             let SnapshotRecord { summary, assessment, mut files, .. } = record;
             files.retain(|file| file.name != "manifest.json");
             files.sort_by(|a, b| a.name.cmp(&b.name));
-            SnapshotEntry { snapshot, summary, assessment, files }
+            let warnings = self.warnings_of(snapshot as usize);
+            let verdict = Assessment::verdict(&warnings, assessment.as_ref());
+            SnapshotEntry { snapshot, summary, verdict, assessment, files }
         };
         let snapshots = snapshots.into_iter().map(entry).collect();
         JobManifest {
@@ -241,6 +245,8 @@ pub struct Content {
     /// The records of all tiles of the snapshot, run by run, in the plan's order.
     tiles: Vec<TileRecord>,
     pub summary: TileRecord,
+    /// The verdict on the frames; null if nothing was found and there is no prediction.
+    pub verdict: Option<Grade>,
     /// The predicted quality of the frames; null where there is no prediction.
     pub assessment: Option<Assessment>,
     camera: Option<CameraRecord>,
@@ -327,6 +333,7 @@ struct JobContent {
 struct SnapshotEntry {
     snapshot: u32,
     summary: TileRecord,
+    verdict: Option<Grade>,
     assessment: Option<Assessment>,
     /// The files of the snapshot except its manifest, which has times that differ from run to run.
     files: Vec<ResultFile>,

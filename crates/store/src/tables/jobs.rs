@@ -7,7 +7,7 @@ use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Page, Span};
 use engine::job::{
-    Assessment, CalibrationId, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
+    Assessment, CalibrationId, Grade, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
     Timestamp,
 };
 
@@ -24,6 +24,21 @@ pub struct Job {
     pub finished_at: Option<Timestamp>,
     /// Predicted quality of its frames; `None` before the job has succeeded, and where no prediction exists.
     pub assessment: Option<Assessment>,
+}
+
+impl Job {
+    /// The verdict on its frames. Before its end only findings count; a job without a result has none.
+    pub fn verdict(&self) -> Option<Grade> {
+        let has_no_result = matches!(self.state, JobState::Failed | JobState::Cancelled);
+        let verdict = Assessment::verdict(&self.spec.warnings, self.assessment.as_ref());
+        verdict.filter(|_| !has_no_result)
+    }
+
+    /// The verdict in a line; `None` until it has succeeded.
+    pub fn verdict_text(&self) -> Option<String> {
+        (self.state == JobState::Succeeded)
+            .then(|| Assessment::verdict_text(self.verdict(), self.assessment.as_ref()))
+    }
 }
 
 from_row!(Job, row => {
