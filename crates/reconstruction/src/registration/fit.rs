@@ -48,7 +48,8 @@ pub struct Grid {
 pub struct Fit {
     pub minimum: Similarity,
     pub uncertainty: Uncertainty,
-    /// True if the quadratic has a minimum, close to the centre of the grid.
+    /// True if the quadratic has a minimum close to the centre of the grid. If it has none, true if the centre has the smallest
+    /// error: errors behind sharp masks have a kink there.
     pub has_settled: bool,
     /// True if rotation and growth are significant, and large enough to be seen.
     pub has_turned: bool,
@@ -83,9 +84,11 @@ impl Fit {
             let smallest = (0..9).min_by(|a, b| error(*a).total_cmp(&error(*b))).unwrap_or(4);
             let [row, column] = [smallest / 3, smallest % 3].map(|place| place as f64 - 1.0);
             let change = frame.change([row, column, 0.0, 0.0], step, sensor);
-            let uncertainty = Uncertainty { shift: [step; 2], ..Uncertainty::default() };
+            let turn = if free == Free::All { step / frame.radius } else { 0.0 };
+            let uncertainty =
+                Uncertainty { shift: [step; 2], rotation: turn.to_degrees(), scale: turn };
             let minimum = moved(centre, change);
-            return Self { minimum, uncertainty, has_settled: false, has_turned: false };
+            return Self { minimum, uncertainty, has_settled: smallest == 4, has_turned: false };
         };
         let lowest = product(&inverse, sum.gradient).map(|value| -value);
         let centres = grids.iter().flat_map(|grid| grid.centre);

@@ -41,8 +41,8 @@ const SHARE: f64 = 0.1;
 const ITERATIONS: (usize, usize) = (8, 24);
 /// Distances in pixels between the displacements of the first grids of the refinement.
 const STEPS: [f64; 2] = [0.5, 0.25];
-/// Largest number of grids at each of these distances on a piece alone.
-const LOCAL_GRIDS: [usize; 2] = [3, 2];
+/// Largest number of grids on a piece alone, at each of these distances and at the first of [`LAST_STEPS`].
+const LOCAL_GRIDS: [usize; 3] = [3, 2, 3];
 /// Distances in pixels between the displacements of the last grids: each grid is repeated until it has settled.
 const LAST_STEPS: [f64; 3] = [0.125, 0.0625, 0.03125];
 /// Largest number of these grids.
@@ -284,7 +284,7 @@ struct Search<'a> {
 impl<'a> Search<'a> {
     fn new(plan: &'a Plan, first: Piece, proceed: &'a mut dyn FnMut(f64) -> bool) -> Self {
         let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
-        let grids = 1 + LOCAL_GRIDS.iter().sum::<usize>();
+        let grids = LOCAL_GRIDS.iter().sum::<usize>();
         let others = plan.others.first().map_or(0, |others| 9 * grids * (1 + others.len()));
         let total = (2 * plan.reach() + 1).pow(2) * ITERATIONS.0 + (runs + others) * ITERATIONS.1;
         Self { plan, pieces: vec![first], proceed, done: 0.0, total: total as f64 }
@@ -390,6 +390,19 @@ impl<'a> Search<'a> {
                 }
             }
             let fit = self.fit(best, &grids, fine, Free::All);
+            for g in &grids {
+                let one = self.fit(best, std::slice::from_ref(g), fine, Free::Shift);
+                let e: Vec<f64> = g.errors.iter().map(|e| e.iter().sum::<f64>()).collect();
+                eprintln!(
+                    g.centre,
+                    middle(&g.places),
+                    one.minimum.shift,
+                    one.uncertainty.shift,
+                    one.has_settled,
+                    e
+                );
+            }
+            eprintln!(fit.minimum, best.interpolation, fit.has_turned);
             has_turned |= fit.has_turned;
             // If neighbours do not turn, farther pieces are not read.
             if !has_turned {
@@ -417,19 +430,20 @@ impl<'a> Search<'a> {
     /// no quadratic half a pixel away. `None` if it has no light.
     fn local_grid(&mut self, piece: usize, best: Correction) -> Result<Option<Grid>> {
         let mut local = best;
-        for (step, count) in STEPS.into_iter().zip(LOCAL_GRIDS) {
+        let mut last = None;
+        for (step, count) in [STEPS[0], STEPS[1], LAST_STEPS[0]].into_iter().zip(LOCAL_GRIDS) {
             for _ in 0..count {
                 let Some(grid) = self.grid(piece, local, step)? else { return Ok(None) };
-                let fit = self.fit(local, &[grid], step, Free::Shift);
+                let centre = [0, 1].map(|axis| local.motion.shift[axis] - best.motion.shift[axis]);
+                let fit = self.fit(local, std::slice::from_ref(&grid), step, Free::Shift);
                 local.motion = fit.minimum;
+                last = Some(Grid { centre, ..grid });
                 if fit.has_settled {
                     break;
                 }
             }
         }
-        let [row, column] = [0, 1].map(|axis| local.motion.shift[axis] - best.motion.shift[axis]);
-        let grid = self.grid(piece, local, LAST_STEPS[0])?;
-        Ok(grid.map(|grid| Grid { centre: [row, column], ..grid }))
+        Ok(last)
     }
 
     /// Fits ever finer grids until each has settled. `None` if a reconstruction diverges.
@@ -442,6 +456,7 @@ impl<'a> Search<'a> {
             let Some(grids) = self.grids(best, *step)? else { return Ok(None) };
             let fit = self.fit(best, &grids, *step, free);
             best.motion = fit.minimum;
+            eprintln!(best.motion, best.interpolation, fit.has_settled);
             if fit.has_settled {
                 steps.next();
             }
