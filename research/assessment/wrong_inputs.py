@@ -429,7 +429,7 @@ class Bench(Runs):
             report = json.loads(done.stdout)
             errors = ((np.load(folder / 'out/frames.npy') - given.truth) ** 2).mean(0)
         assessment = report['assessment'] or {}
-        return {'findings': [[one['code'], one['detail']] for one in report['findings']], 'grade': assessment.get('grade'), 'order': assessment.get('order'),
+        return {'findings': [[one['code'], one['detail']] for one in report['findings']], 'grade': report['verdict'], 'order': assessment.get('order'),
                 'expected_db': assessment.get('psnr_db'), 'true_db': report['psnr_db'], 'unit_db': report['psnr_unit_db'], 'parts_db': parts(errors)}
 
 
@@ -503,7 +503,7 @@ PAGE = """\
 `make eval-wrong-inputs` tries each kind of wrong input on many scenes. The table states the
 [finding](../../docs/FINDINGS.md) that names its cause, how many inputs are flagged at all, and for how many the first
 finding names the cause. The last column counts results that lose more than 3 dB by wrong masks and are graded better
-than doubtful: they have an expected PSNR and no grade `bad`. An order counts where it costs 0.5 dB or more, fast motion where it costs 3 dB.
+than `doubtful`. An order counts where it costs 0.5 dB or more, fast motion where it costs 3 dB.
 [BENCHMARKS.md](../../docs/BENCHMARKS.md#are-wrong-inputs-noticed) states the conditions and a summary.
 
 """
@@ -545,7 +545,7 @@ def report(a):
         named = [names_cause(row, kind.causes) for row in own]
         flagged = [bool(alarms(row)) or named for row, named in zip(own, named)]
         harmful = [row for row in own if (loss(row, right_of(row)) or 0) > LOSS] if kind.masks else []
-        praised = [row for row in harmful if row['grade'] == 'good' or row['expected_db'] is not None and row['grade'] != 'bad']
+        praised = [row for row in harmful if row['grade'] not in ('doubtful', 'bad')]
         table[kind.name] = (kind, len(own), sum(flagged), sum(named), (len(praised), len(harmful)) if kind.masks else None)
         out[kind.name] = {'of': len(own), 'flagged': sum(flagged), 'named_first': sum(named)}
         if not a.markdown:

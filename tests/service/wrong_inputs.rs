@@ -42,10 +42,15 @@ fn grey_masks() -> Vec<f32> {
     (0..FRAMES * PIXELS).map(place).collect()
 }
 
-/// A snapshot of a moving pattern behind masks.
+/// A snapshot of a pattern that moves by 1.5 pixels a frame behind masks.
 fn snapshot(masks: &[f32]) -> Vec<f32> {
+    snapshot_at(masks, 1.5)
+}
+
+/// A snapshot of a pattern that moves by `speed` pixels a frame behind masks.
+fn snapshot_at(masks: &[f32], speed: f32) -> Vec<f32> {
     let pixel = |k: usize, at: usize| {
-        let (row, column) = ((at / SIDE) as f32, (at % SIDE) as f32 + 1.5 * k as f32);
+        let (row, column) = ((at / SIDE) as f32, (at % SIDE) as f32 + speed * k as f32);
         0.45 + 0.2 * (column * 0.2).sin() * (row * 0.15).cos()
             + 0.1 * (column * 0.31 + row * 0.27).sin()
     };
@@ -196,6 +201,21 @@ fn exchanged_masks_are_found_by_the_motion() {
     let (assessment, codes) = reconstruct(&masks, &y);
     assert_eq!(codes, ["exchanged_masks"]);
     assert_eq!((&assessment["order"], &assessment["psnr_db"]), (&"doubtful".into(), &Value::Null));
+}
+
+#[test]
+fn an_order_that_can_t_be_verified_comes_with_its_reason() {
+    let grey = grey_masks();
+    let masks = scene().0;
+    for (masks, speed, reason) in [
+        (&masks, 0.0, "the scene moves too little"),
+        (&grey, 1.5, "the masks resemble one another"),
+    ] {
+        let (assessment, _) = reconstruct(masks, &snapshot_at(masks, speed));
+        assert_eq!(assessment["order"], "not_verifiable");
+        let found = assessment["order_reason"].as_str().unwrap();
+        assert!(found.starts_with(reason), "{found}");
+    }
 }
 
 #[test]

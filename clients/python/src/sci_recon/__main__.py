@@ -43,7 +43,7 @@ def registration(text: str) -> str | dict[str, Any]:
         return text
     try:
         rows, columns, *more = [float(number) for number in text.split(",")]
-        rotation, scale = [*more, *(0.0, 1.0)[len(more):]]
+        rotation, scale = [*more, *(0.0, 1.0)[len(more) :]]
     except ValueError:
         form = "off, auto, or ROWS,COLUMNS[,DEGREES[,SCALE]], such as 0.5,-1.2 for a shift in pixels"
         raise argparse.ArgumentTypeError(f"{text!r}; give {form}") from None

@@ -114,7 +114,12 @@ class Watch:
 
     def _key(self, path: Path) -> str | None:
         """The key of a file and its present content. Paths that are not files of snapshots have no key."""
-        if path.name.startswith(".") or path.suffix.lower() not in self.endings or path.is_symlink() or not path.is_file():
+        if (
+            path.name.startswith(".")
+            or path.suffix.lower() not in self.endings
+            or path.is_symlink()
+            or not path.is_file()
+        ):
             return None
         try:
             meta = path.stat()

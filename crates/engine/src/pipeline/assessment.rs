@@ -223,7 +223,7 @@ fn common_order(orders: &[Order]) -> Option<MaskOrder> {
 fn unverifiable_order(orders: &[Order], motion: f32) -> Option<&'static str> {
     (common_order(orders) == Some(MaskOrder::NotVerifiable)).then(|| {
         if orders.contains(&Order::SimilarMasks) {
-            "the masks resemble one another, and so do their frames in any order"
+            "the masks resemble one another"
         } else if motion > FAST_MOTION {
             "the scene moves too fast"
         } else {
