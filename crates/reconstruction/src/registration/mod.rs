@@ -390,19 +390,6 @@ impl<'a> Search<'a> {
                 }
             }
             let fit = self.fit(best, &grids, fine, Free::All);
-            for g in &grids {
-                let one = self.fit(best, std::slice::from_ref(g), fine, Free::Shift);
-                let e: Vec<f64> = g.errors.iter().map(|e| e.iter().sum::<f64>()).collect();
-                eprintln!(
-                    g.centre,
-                    middle(&g.places),
-                    one.minimum.shift,
-                    one.uncertainty.shift,
-                    one.has_settled,
-                    e
-                );
-            }
-            eprintln!(fit.minimum, best.interpolation, fit.has_turned);
             has_turned |= fit.has_turned;
             // If neighbours do not turn, farther pieces are not read.
             if !has_turned {
@@ -456,7 +443,6 @@ impl<'a> Search<'a> {
             let Some(grids) = self.grids(best, *step)? else { return Ok(None) };
             let fit = self.fit(best, &grids, *step, free);
             best.motion = fit.minimum;
-            eprintln!(best.motion, best.interpolation, fit.has_settled);
             if fit.has_settled {
                 steps.next();
             }
