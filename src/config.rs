@@ -75,7 +75,7 @@ pub struct ServeArguments {
 
     /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
     /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
-    /// one per core].
+    /// one per core, one on a GPU].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
 
@@ -502,7 +502,11 @@ impl ServeArguments {
 
     #[must_use]
     pub fn worker_count(&self) -> usize {
-        let cores = || std::thread::available_parallelism().map_or(1, usize::from);
+        let cores = || match self.engine.device.as_str() {
+            "cpu" => std::thread::available_parallelism().map_or(1, usize::from),
+            // Workers that share a GPU share its memory, too.
+            _ => 1,
+        };
         // Tasks that do not leave this machine need a worker.
         let minimum = usize::from(self.without_tiles());
         self.workers.unwrap_or_else(cores).max(minimum)
@@ -647,6 +651,17 @@ mod tests {
         let error = serve(&["--listen", "0.0.0.0:80"]).unwrap_err().to_string();
         assert!(error.contains("--allow-remote"), "{error}");
         assert!(serve(&["--listen", "0.0.0.0:80", "--allow-remote"]).is_ok());
+    }
+
+    #[test]
+    fn one_worker_uses_a_gpu_unless_others_are_wanted() {
+        let count = |more: &[&str]| {
+            let line = [&["serve", "--data", "d"], more].concat();
+            Serve::try_parse_from(line).unwrap().arguments.worker_count()
+        };
+        assert_eq!(count(&["--device", "gpu"]), 1);
+        assert_eq!(count(&["--device", "cuda:0", "--workers", "3"]), 3);
+        assert_eq!(count(&[]), std::thread::available_parallelism().unwrap().get());
     }
 
     #[test]
