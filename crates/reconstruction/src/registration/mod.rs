@@ -283,7 +283,7 @@ struct Search<'a> {
 
 impl<'a> Search<'a> {
     fn new(plan: &'a Plan, first: Piece, proceed: &'a mut dyn FnMut(f64) -> bool) -> Self {
-        let runs = STEPS.len() * 9 + MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
+        let runs = STEPS.len() * 9 + 2 * MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
         let grids = LOCAL_GRIDS.iter().sum::<usize>();
         let others = plan.others.first().map_or(0, |others| 9 * grids * (1 + others.len()));
         let total = (2 * plan.reach() + 1).pow(2) * ITERATIONS.0 + (runs + others) * ITERATIONS.1;
@@ -348,15 +348,27 @@ impl<'a> Search<'a> {
             return Ok(best.1);
         }
         for interpolation in Interpolation::ALL {
-            let place = Correction { motion, interpolation };
-            let Some(errors) = self.errors(0, place, 0, ITERATIONS.1)? else { continue };
-            let Some(wrong) = self.errors(0, place.elsewhere(), 0, ITERATIONS.1)? else { continue };
-            let ratio = errors.iter().sum::<f64>() / wrong.iter().sum::<f64>();
+            let ratio = self.ratio(1, Correction { motion, interpolation })?;
             if ratio < best.0 {
                 best = (ratio, interpolation);
             }
         }
         Ok(best.1)
+    }
+
+    /// The error of the first `count` pieces relative to that of the same masks elsewhere; infinite if they are dark or the
+    /// solver diverges.
+    fn ratio(&mut self, count: usize, place: Correction) -> Result<f64> {
+        let mut sums = [0.0; 2];
+        for piece in 0..count {
+            for (sum, place) in sums.iter_mut().zip([place, place.elsewhere()]) {
+                let Some(errors) = self.errors(piece, place, 0, ITERATIONS.1)? else {
+                    return Ok(f64::INFINITY);
+                };
+                *sum += errors.iter().sum::<f64>();
+            }
+        }
+        Ok(sums[0] / sums[1])
     }
 
     /// Estimates rotation and growth too, after the first piece has given a shift and, `turned`, all parameters. `None` if
@@ -433,13 +445,46 @@ impl<'a> Search<'a> {
         Ok(last)
     }
 
-    /// Fits ever finer grids until each has settled. `None` if a reconstruction diverges.
-    fn settle(&mut self, mut best: Correction, free: Free) -> Result<Option<(Correction, Fit)>> {
+    /// Fits ever finer grids until each has settled, and tries the other interpolations at the end: a motion that is a little
+    /// wrong favours smooth ones, and these bias it. `None` if a reconstruction diverges.
+    fn settle(&mut self, best: Correction, free: Free) -> Result<Option<(Correction, Fit)>> {
+        let Some(settled) = self.refine(best, free, true)? else { return Ok(None) };
+        if settled.0.motion.is_whole() {
+            return Ok(Some(settled));
+        }
+        let count = self.pieces.len();
+        let (mut smallest, mut better) = (self.ratio(count, settled.0)?, None);
+        for interpolation in Interpolation::ALL {
+            let mut other = Correction { interpolation, ..settled.0 };
+            if other == settled.0 {
+                continue;
+            }
+            let Some(grids) = self.grids(other, LAST_STEPS[0])? else { continue };
+            other.motion = self.fit(other, &grids, LAST_STEPS[0], free).minimum;
+            let ratio = self.ratio(self.pieces.len(), other)?;
+            if ratio < smallest {
+                (smallest, better) = (ratio, Some(other));
+            }
+        }
+        let Some(better) = better else { return Ok(Some(settled)) };
+        Ok(self.refine(better, free, false)?.or(Some(settled)))
+    }
+
+    /// Fits ever finer grids until each has settled. If `chooses`, the interpolation is chosen anew for each grid. `None` if a
+    /// reconstruction diverges.
+    fn refine(
+        &mut self,
+        mut best: Correction,
+        free: Free,
+        chooses: bool,
+    ) -> Result<Option<(Correction, Fit)>> {
         let mut last = None;
         let mut steps = LAST_STEPS.into_iter().peekable();
         for _ in 0..MAX_GRIDS {
             let Some(step) = steps.peek() else { break };
-            best.interpolation = self.interpolation(best.motion)?;
+            if chooses {
+                best.interpolation = self.interpolation(best.motion)?;
+            }
             let Some(grids) = self.grids(best, *step)? else { return Ok(None) };
             let fit = self.fit(best, &grids, *step, free);
             best.motion = fit.minimum;
