@@ -470,7 +470,7 @@ impl<'a> Search<'a> {
         Ok(self.refine(better, free, false)?.or(Some(settled)))
     }
 
-    /// Fits ever finer grids until each has settled. If `chooses`, the interpolation is chosen anew for each grid. `None` if a
+    /// Fits ever finer grids until each has settled. If `chooses`, the interpolation is chosen again for each grid. `None` if a
     /// reconstruction diverges.
     fn refine(
         &mut self,
