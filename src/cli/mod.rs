@@ -20,6 +20,7 @@ mod output;
 mod progress;
 mod settings;
 mod shell;
+mod stop;
 mod submission;
 mod supervisor;
 mod verdict;

@@ -7,13 +7,13 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::confine::confinement;
 use super::logging;
 use super::maintenance::maintain;
+use super::stop::{stop_signal, stopped};
 use super::supervisor::Supervisor;
 use crate::audit::AuditLog;
 use crate::config::{
@@ -236,23 +236,6 @@ async fn cluster(
         verify_fraction: *verify_fraction,
     };
     Ok(Some(Hub::start(store.clone(), access, settings)))
-}
-
-/// Starts to listen for SIGTERM and Ctrl-C. The future completes at the first one.
-pub(super) fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
-    let mut terminate = signal(SignalKind::terminate())?;
-    let mut interrupt = signal(SignalKind::interrupt())?;
-    Ok(async move {
-        tokio::select! {
-            _ = terminate.recv() => tracing::info!("stopping on SIGTERM"),
-            _ = interrupt.recv() => tracing::info!("stopping on Ctrl-C"),
-        }
-    })
-}
-
-pub(super) async fn stopped(mut stop: watch::Receiver<bool>) {
-    // An error means that the sender was dropped, which is a stop as well.
-    let _ = stop.wait_for(|stop| *stop).await;
 }
 
 async fn drain_time_over(stop: watch::Receiver<bool>) {

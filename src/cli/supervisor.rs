@@ -14,7 +14,7 @@ use tokio::process::{Child, ChildStdout, Command};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use super::serve::stopped;
+use super::stop::stopped;
 use crate::config::{DEVICE_LOST, DeviceState, Takes, WorkerArguments};
 use engine::job::WorkerId;
 use engine::pipeline::usage::{kills_for_memory, peak_rss_of};

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 use super::confine::{confine_worker, folders_of, limit_memory};
 use super::guard::guard;
 use super::output::print_line;
-use super::serve::stop_signal;
+use super::stop::stop_signal;
 use super::supervisor::device_line;
 use super::{CliError, logging};
 use crate::cli::error::Result;

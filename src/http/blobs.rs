@@ -109,7 +109,8 @@ pub(super) async fn delete(
     Params(sha256): Params<Sha256>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard = request.precondition(&app, &access.lab, body(&app, &access, sha256)).await?;
+    let _guard =
+        request.precondition(&app.changes, &access.lab, body(&app, &access, sha256)).await?;
     app.store.delete_upload(&access.lab, sha256).await?;
     Ok(StatusCode::NO_CONTENT)
 }

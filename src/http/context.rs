@@ -10,9 +10,9 @@ use axum::response::Response;
 use serde::Serialize;
 use tokio::sync::OwnedMutexGuard;
 
-use super::app::App;
 use super::conditional;
 use super::error::{ApiError, Result};
+use super::shares::Changes;
 use engine::job::Lab;
 
 const PREFER: HeaderName = HeaderName::from_static("prefer");
@@ -71,11 +71,11 @@ impl RequestContext {
     /// other request changes anything of the lab until the guard is dropped.
     pub(super) async fn precondition<T: Serialize>(
         &self,
-        app: &App,
+        changes: &Changes,
         lab: &Lab,
         current: impl Future<Output = Result<T>>,
     ) -> Result<OwnedMutexGuard<()>> {
-        let guard = app.changes.lock(lab).await;
+        let guard = changes.lock(lab).await;
         if self.headers.contains_key(header::IF_MATCH) {
             conditional::check_match(&self.headers, &conditional::etag_of(&current.await?)?)?;
         }
