@@ -26,6 +26,10 @@ use workers::{Local, ModelCommand, Worker, WorkerError};
 pub fn run(settings: &WorkerArguments) -> Result<()> {
     logging::start(settings.log_format);
     lower_priority(settings.engine.nice)?;
+    // If the memory of the machine or group ends, the kernel should end a worker, not the service. Its task is tried again.
+    if let Err(error) = std::fs::write("/proc/self/oom_score_adj", "500") {
+        tracing::debug!(%error, "the kernel does not prefer this worker when memory ends");
+    }
     // A confined worker can't read the limits of its control group.
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     if let Some(bytes) = settings.memory_limit() {
