@@ -60,8 +60,7 @@ pub struct Report {
 ///
 /// The masks' scale is known only after the last one, so they are first written to `scratch`, an existing file. Then
 /// the normalised masks go to the writer that `open` returns, with NaN where the map `bad` is not 0. No statistic of the
-/// report has these pixels. Returns the report and
-/// the output of the writer.
+/// report has these pixels. Returns the report and the output of the writer.
 ///
 /// Errors: unreadable or unusable captures or patterns; I/O; [`IntakeError::Stopped`]; those of `open`.
 pub fn calibrate<W: Write>(
