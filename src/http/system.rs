@@ -169,6 +169,8 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
     let [database, disk, workers] =
         checks.map(|check| check.err().unwrap_or_else(|| "ok".to_owned()));
     let status = if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
+    // A device that is refused between the two is named by both.
+    let device = device_state(&app);
     let networks = app.networks();
     let tiles =
         app.tiles().await.unwrap_or_else(|_| Err("the database does not answer".to_owned()));
@@ -177,7 +179,6 @@ pub(super) async fn ready(State(app): State<App>) -> Response {
     let networks = networks.err().unwrap_or_else(|| "ok".to_owned());
     let cluster = cluster.map(|trouble| trouble.unwrap_or_else(|| "ok".to_owned()));
     let confinement = app.machine.confinement.clone().err().unwrap_or_else(|| "ok".to_owned());
-    let device = device_state(&app);
     let body = Readiness {
         ready,
         degraded,
