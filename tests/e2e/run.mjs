@@ -8,7 +8,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, bands, captures, colour, compare, decided, ending, judged, manage, matlab, mended, moved, movie, network, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, bands, captures, colour, compare, decided, ending, judged, manage, matlab, mended, moved, movie, network, options, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene, spectral } from "./scene.mjs";
@@ -55,6 +55,7 @@ async function everything() {
   await checks.look(page, "job-pilot");
   await checks.step("captures", () => captures(page, checks, small));
   await checks.step("matlab", () => matlab(page, checks, service));
+  await checks.step("options", () => options(page, checks, service));
   await checks.step("colour", () => colour(page, checks, scene(FRAMES, 192, 256, 1, true)));
   await checks.step("movie in colour", () => movie(page, checks, [FRAMES, 192, 256]));
   await checks.step("mended", () => mended(page, checks, service));
