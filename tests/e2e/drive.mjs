@@ -131,7 +131,7 @@ export async function matlab(page, checks, service) {
 
 const bench = (name) => readFileSync(new URL(`../data/ways/${name}`, import.meta.url));
 
-/** What a job has made of its inputs. */
+/** Facts, findings, verdict and frames of a job. */
 async function effect(service, id) {
   const job = await service.call("GET", `/v1/jobs/${id}`);
   const measurement = await service.call("GET", `/v1/measurements/${job.measurement}`);

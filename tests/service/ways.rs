@@ -1,5 +1,4 @@
-//! Every way in has the same effect: the inputs of `tests/data/ways` need each option of `requests.json`, and give the same frames,
-//! findings and verdict whoever sends them.
+//! The inputs of `tests/data/ways` need each option of `requests.json`. All ways in must give the same frames, findings and verdict.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -42,7 +41,7 @@ fn codes(warnings: &Value) -> Value {
     warnings.as_array().unwrap().iter().map(|finding| finding["code"].clone()).collect()
 }
 
-/// What a job has made of its inputs. `reading`: with the parts of the files that were read.
+/// Facts, findings, verdict and frames of a job. `reading` includes the parts of the files that were read.
 async fn effect(app: &TestApp, job: &str, reading: bool) -> Value {
     let job = app.ended(job).await;
     assert_eq!(job["state"], "succeeded", "{job:#}");
@@ -67,8 +66,8 @@ async fn effect(app: &TestApp, job: &str, reading: bool) -> Value {
     })
 }
 
-/// Sends the requests of an input over HTTP; returns the job, or the answer that refuses one of them.
-async fn over_http(app: &TestApp, all: &Value, input: Input) -> Result<String, Answer> {
+/// Sends the requests of an input over HTTP; returns the job, or `None` if one of them is refused.
+async fn over_http(app: &TestApp, all: &Value, input: Input) -> Option<String> {
     let with = |name: &str, more: Value| {
         let mut body = all[name].as_object().unwrap().clone();
         body.extend(more.as_object().unwrap().clone());
@@ -84,8 +83,8 @@ async fn over_http(app: &TestApp, all: &Value, input: Input) -> Result<String, A
     accepted(app.post("/v1/jobs", &body).await)
 }
 
-fn accepted(answer: Answer) -> Result<String, Answer> {
-    if answer.status.is_success() { Ok(id(&answer)) } else { Err(answer) }
+fn accepted(answer: Answer) -> Option<String> {
+    answer.status.is_success().then(|| id(&answer))
 }
 
 /// The requests with the hashes of dark captures and the map of bad pixels.
@@ -132,7 +131,7 @@ async fn every_option_of_the_requests_has_its_effect() {
             {
                 let mut others = all.clone();
                 others[request].as_object_mut().unwrap().remove(name);
-                let Ok(job) = over_http(&app, &others, input).await else { continue };
+                let Some(job) = over_http(&app, &others, input).await else { continue };
                 let other = effect(&app, &job, false).await;
                 assert_ne!(other["frames"], whole["frames"], "{request} without {name}: {other:#}");
             }
@@ -141,7 +140,7 @@ async fn every_option_of_the_requests_has_its_effect() {
     assert_eq!(frames["measurement"], frames["packed"], "the files hold the same numbers");
 }
 
-/// The options of the command line for the requests of an input. Those of masks start with `masks-`.
+/// The options of the command line for the requests of an input. Options of masks start with `masks-`.
 fn options(all: &Value, input: Input) -> Vec<String> {
     let path = |name: &str| format!("{FOLDER}/{name}");
     let files = [("masks", "bench.h5"), ("bad-pixels", "bad.npy"), ("dark", input.dark)];

@@ -69,7 +69,7 @@ impl<'de> Visitor<'de> for RequestVisitor {
 /// Findings of a measurement's check on masks that have moved since the calibration.
 const DRIFT: [FindingCode; 3] =
     [FindingCode::DriftedMasks, FindingCode::ShiftedMasks, FindingCode::ForeignMasks];
-/// Those of them that a stated motion answers: nothing has tested it against masks of another camera.
+/// The part of [`DRIFT`] that a stated motion answers. Nothing has tested this motion against masks of another camera.
 const MOTION: &[FindingCode] = DRIFT.split_at(2).0;
 
 impl RegistrationRequest {
