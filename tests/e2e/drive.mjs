@@ -276,6 +276,24 @@ export async function mended(page, checks, service) {
   await page.waitForSelector("text=The measurement fits the calibration.");
 }
 
+/** Every refusal of the service links the page that says what to do. */
+export async function refusals(page, checks, service, scene) {
+  const { components } = await service.call("GET", "/openapi.json");
+  const codes = components.schemas.Problem.properties.code["x-extensible-enum"];
+  await page.click("#nav >> text=New job");
+  await page.check("input[value=masks]");
+  for (const code of codes) {
+    const json = { status: 422, code, title: "Refused", detail: "the file is refused" };
+    await page.route("**/v1/calibrations", (route) => route.fulfill({ status: 422, contentType: "application/problem+json", json }));
+    await drop(page, "label.drop:has(#masks)", `${code}.npy`, scene.masks);
+    const link = await page.waitForSelector(`.step:nth-child(1) .trouble a[href$='problems/${code}']`);
+    const { status } = await fetch(await link.evaluate((element) => element.href));
+    checks.that(status === 200, `the link explains ${code}: ${status}`);
+    await page.unroute("**/v1/calibrations");
+  }
+  checks.that(codes.length > 20, `there are ${codes.length} codes`);
+}
+
 /** Reconstructs a snapshot of a spectral camera, from its only mask to a spectrum. */
 export async function spectrum(page, checks, scene, bands) {
   await page.click("#nav >> text=New job");
@@ -473,6 +491,8 @@ export async function view(page, checks, frames) {
     slider.dispatchEvent(new Event("input"));
   }, frames);
   await checks.until(() => brightness(page), ({ left, right }) => right > left, "the bright square moves to the right");
+  const downloads = await page.textContent(".downloads");
+  checks.that(downloads.includes(`${frames} single frames`), `each frame is counted once: ${downloads}`);
 
   // Load all frames before the rate is measured.
   await page.fill("#rate", "20");
