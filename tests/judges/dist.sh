@@ -70,7 +70,7 @@ fetched=$(find "$root/lab/out" -name frames.npy -size +0 | wc -l)
 kill $server && wait $server
 server=
 
-# The demo of the README, which starts a service of its own.
+# The demo of the README starts another service.
 demo=$(run demo --out /lab/demo --json | jq '.pnp_tv_fastdvdnet.psnr_db')
 jq --exit-status --null-input --argjson demo "$demo" '$demo > 25' > /dev/null || { echo "the demo has $demo dB" >&2; exit 1; }
 [ -s "$root/lab/demo/report.html" ] || { echo "the demo has no page" >&2; exit 1; }
