@@ -20,6 +20,7 @@ pub enum Order {
     /// The masks resemble one another, so the test is impossible.
     SimilarMasks,
     /// An exchange of two frames, counted from 0, makes the steps much shorter.
+    #[schemars(with = "[usize; 2]")]
     Exchanged(usize, usize),
 }
 
