@@ -59,6 +59,7 @@ mod tests {
     use engine::job::{
         CalibrationReport, CalibrationRequest, JobRequest, MeasurementRequest, ModelRequest,
     };
+    use engine::pipeline::manifest::{JobManifest, Manifest};
     use store::{Blob, BlobRow, TileHistory};
 
     const PROSE: &str = include_str!("contract.yaml");
@@ -291,7 +292,7 @@ mod tests {
             algorithms::ListBody, PageBody<JobBody>, jobs::EstimateBody, samples::SampleBody,
             exports::movie::ExportBody, PageBody<results::SnapshotBody>, quality::QualityBody, tiles::TilesBody,
             TileHistory, SpreadBody, events::Change, system::SystemBody, system::Readiness,
-            system::Liveness, Problem, Blob, labs::LabBody,
+            system::Liveness, Problem, Blob, labs::LabBody, Manifest, JobManifest,
         };
         schemas.values_mut().for_each(|schema| plain(schema, true));
         schemas

@@ -129,6 +129,87 @@ export async function matlab(page, checks, service) {
   await checks.look(page, "matlab");
 }
 
+const bench = (name) => readFileSync(new URL(`../data/ways/${name}`, import.meta.url));
+
+/** Facts, findings, verdict and frames of a job. */
+async function effect(service, id) {
+  const job = await service.call("GET", `/v1/jobs/${id}`);
+  const measurement = await service.call("GET", `/v1/measurements/${job.measurement}`);
+  const calibration = await service.call("GET", `/v1/calibrations/${measurement.calibration}`);
+  const facts = ({ axes, reading, format, full_scale, height, width }) => ({ axes, reading, format, full_scale, height, width });
+  const codes = [measurement, job].map(({ warnings }) => warnings.map(({ code }) => code));
+  const frames = await fetch(`${service.url}/v1/jobs/${id}/exports/npy`);
+  return JSON.stringify({
+    calibration: [facts(calibration), calibration.frames, calibration.mask_mean], measurement: [facts(measurement), measurement.dark], codes,
+    job: [job.registration, job.verdict, job.verdict_text], frames: Buffer.from(await frames.arrayBuffer()).toString("base64"),
+  });
+}
+
+/** The effect of the requests of tests/data/ways without the form; `input` names that of the measurement. */
+async function requested(service, input, data, dark) {
+  const requests = JSON.parse(bench("requests.json"));
+  const hash = async (name) => (await service.call("POST", "/v1/blobs", bench(name))).sha256;
+  const calibration = await service.call("POST", "/v1/calibrations", { ...requests.calibration, masks: await hash("bench.h5"), bad_pixels: await hash("bad.npy") });
+  const measurement = await service.call("POST", "/v1/measurements", { ...requests[input], calibration: calibration.id, data: await hash(data), dark: [await hash(dark)] });
+  const { id } = await service.submit({ ...requests.job, measurement: measurement.id });
+  await service.when(id, (job) => job.state === "succeeded");
+  return effect(service, id);
+}
+
+/** States every option in the form. The job is that of the same requests without the form. */
+export async function options(page, checks, service) {
+  const [masks, data] = ["label.drop:has(#masks)", "label.drop:has(#data)"];
+  const [first, second] = [1, 2].map((number) => `.step:nth-child(${number})`);
+  const window = async (part) => {
+    for (const [side, value] of Object.entries({ row: 8, column: 8, height: 64, width: 64 })) await page.fill(`#${part}-${side}`, `${value}`);
+  };
+  const scale = async (step, value) => {
+    await page.waitForSelector(`${step} .verdict >> text=is accepted`);
+    await page.click(`${step} summary:has-text('Full scale')`).catch(() => null);
+    await page.fill(`${step} [aria-label='Another full scale']`, value);
+    await page.click(`${step} .askscale >> text=Use`);
+    await page.waitForSelector(`${step} summary:has-text(': ${value}')`);
+  };
+  for (const [input, file, dark] of [["measurement", "bench.h5", "dark.npy"], ["packed", "shots.raw", "dark.raw"]]) {
+    await page.click("#nav >> text=New job");
+    await page.check("input[value=masks]");
+    await page.click(`${first} summary:has-text('Window, masks and packing')`);
+    await window("masks-part");
+    await page.fill("#masks-part-first", "1");
+    await page.fill("#masks-part-last", "8");
+    await page.click("summary:has-text('Map of bad pixels')");
+    await page.setInputFiles("#bad-pixels", { name: "bad.npy", mimeType: "application/octet-stream", buffer: bench("bad.npy") });
+    await drop(page, masks, "bench.h5", bench("bench.h5"));
+    await page.click(".askscale >> text=optics/patterns");
+    await page.click(".askscale >> text=row, column, frame");
+    await scale(first, "1000");
+    await page.click(`${second} summary:has-text('Window, packing and saturation')`);
+    if (input === "measurement") await window("data-part");
+    else await page.selectOption("#data-part-packing", "mono12p");
+    await page.fill("#saturation", "3500");
+    await page.press("#saturation", "Tab");
+    await page.setInputFiles("#darks", { name: dark, mimeType: "application/octet-stream", buffer: bench(dark) });
+    await page.waitForSelector(`text=The mean of ${dark} is subtracted.`);
+    await drop(page, data, file, bench(file));
+    if (input === "measurement") {
+      await page.click(`${second} .askscale >> text=camera/shots`);
+      await page.click(`${second} .askscale >> text=column, row, frame`);
+    }
+    await scale(second, "900");
+    await page.selectOption("#registration", "stated");
+    await page.fill("#shift-rows", "2");
+    await page.fill("#shift-columns", "-1");
+    await page.selectOption("#algorithm", "gap-tv");
+    await page.waitForSelector(".estimate dd");
+    await checks.look(page, `submit-options-${input}`);
+    await page.click("button[type=submit]");
+    await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
+    await state(page, "succeeded");
+    const [shown, expected] = [await effect(service, page.url().slice(-36)), await requested(service, input, file, dark)];
+    checks.that(shown === expected, `the form states every option of ${input}: ${shown.slice(0, 2000)} instead of ${expected.slice(0, 2000)}`);
+  }
+}
+
 /** Reconstructs a measurement of a colour sensor, from the form to frames in colour. */
 export async function colour(page, checks, scene) {
   await page.click("#nav >> text=New job");
@@ -193,6 +274,24 @@ export async function mended(page, checks, service) {
   await page.press("#data-part-row", "Enter");
   await page.click("text=Begin at row 16, column 16");
   await page.waitForSelector("text=The measurement fits the calibration.");
+}
+
+/** Every refusal of the service links the page that says what to do. */
+export async function refusals(page, checks, service, scene) {
+  const { components } = await service.call("GET", "/openapi.json");
+  const codes = components.schemas.Problem.properties.code["x-extensible-enum"];
+  await page.click("#nav >> text=New job");
+  await page.check("input[value=masks]");
+  for (const code of codes) {
+    const json = { status: 422, code, title: "Refused", detail: "the file is refused" };
+    await page.route("**/v1/calibrations", (route) => route.fulfill({ status: 422, contentType: "application/problem+json", json }));
+    await drop(page, "label.drop:has(#masks)", `${code}.npy`, scene.masks);
+    const link = await page.waitForSelector(`.step:nth-child(1) .trouble a[href$='problems/${code}']`);
+    const { status } = await fetch(await link.evaluate((element) => element.href));
+    checks.that(status === 200, `the link explains ${code}: ${status}`);
+    await page.unroute("**/v1/calibrations");
+  }
+  checks.that(codes.length > 20, `there are ${codes.length} codes`);
 }
 
 /** Reconstructs a snapshot of a spectral camera, from its only mask to a spectrum. */
@@ -392,6 +491,8 @@ export async function view(page, checks, frames) {
     slider.dispatchEvent(new Event("input"));
   }, frames);
   await checks.until(() => brightness(page), ({ left, right }) => right > left, "the bright square moves to the right");
+  const downloads = await page.textContent(".downloads");
+  checks.that(downloads.includes(`${frames} single frames`), `each frame is counted once: ${downloads}`);
 
   // Load all frames before the rate is measured.
   await page.fill("#rate", "20");

@@ -8,7 +8,7 @@
 import { fileURLToPath } from "node:url";
 import { chromium } from "playwright-core";
 import { Checks } from "./checks.mjs";
-import { HOSTILE, bands, captures, colour, compare, decided, ending, judged, manage, matlab, mended, moved, movie, network, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
+import { HOSTILE, bands, captures, colour, compare, decided, ending, judged, manage, matlab, mended, moved, movie, network, options, refusals, sample, spectrum, stated, submit, view, watch } from "./drive.mjs";
 import { Service } from "./service.mjs";
 import { fill, scroll, visit } from "./measure.mjs";
 import { scene, spectral } from "./scene.mjs";
@@ -55,9 +55,11 @@ async function everything() {
   await checks.look(page, "job-pilot");
   await checks.step("captures", () => captures(page, checks, small));
   await checks.step("matlab", () => matlab(page, checks, service));
+  await checks.step("options", () => options(page, checks, service));
   await checks.step("colour", () => colour(page, checks, scene(FRAMES, 192, 256, 1, true)));
   await checks.step("movie in colour", () => movie(page, checks, [FRAMES, 192, 256]));
   await checks.step("mended", () => mended(page, checks, service));
+  await checks.step("refusals", () => refusals(page, checks, service, small));
   await checks.step("spectral", () => spectrum(page, checks, spectral(6, 64, 96, 2), 6));
   await checks.step("bands", () => bands(page, checks, service, spectral(6, 64, 96, 2), 6));
   const drifting = scene(FRAMES, 128, 128, 3);
@@ -93,9 +95,13 @@ async function views(page, service) {
   const verdict = ".list tr:has(a:text-is('sample')) .checks";
   await page.waitForSelector(`${verdict}:has-text('dB measured')`);
   checks.that(!(await page.textContent(verdict)).includes("about"), "the list shows the measured PSNR, not the expected one");
+  const cut = await page.$$eval(".list .checks", (cells) => cells.filter((cell) => cell.scrollWidth > cell.clientWidth).map((cell) => cell.textContent));
+  checks.that(cut.length === 0, `no verdict is cut: ${cut}`);
   await checks.look(page, "jobs");
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("table");
+  const lead = await page.textContent(".lead");
+  checks.that(/^(No job runs or waits|\d+ jobs? running, (none|\d+) waiting); 2 workers ready; [\d.]+ [KMGT]iB free\.$/.test(lead), `the state is one sentence: ${lead}`);
   await checks.look(page, "system");
   await page.goto(`${service.url}/#/calibrations`);
   await page.click(".calibration >> nth=0");

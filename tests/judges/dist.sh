@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Tests the archive of `make dist` in an empty root that has only its documented requirements: Debian's packages of
-# glibc and libstdc++. Runs the documented commands: first token, health, the default job, and a lab's files.
+# glibc and libstdc++. Runs the documented commands: first token, health, the default job, a lab's files, and the demo.
 #
 #   tests/judges/dist.sh dist/sci-recon-VERSION-x86_64-linux.tar.gz
 #
@@ -69,6 +69,11 @@ fetched=$(find "$root/lab/out" -name frames.npy -size +0 | wc -l)
 [ "$fetched" = 1 ] || { echo "$fetched results were fetched" >&2; exit 1; }
 kill $server && wait $server
 server=
+
+# The demo of the README starts another service.
+demo=$(run demo --out /lab/demo --json | jq '.pnp_tv_fastdvdnet.psnr_db')
+jq --exit-status --null-input --argjson demo "$demo" '$demo > 25' > /dev/null || { echo "the demo has $demo dB" >&2; exit 1; }
+[ -s "$root/lab/demo/report.html" ] || { echo "the demo has no page" >&2; exit 1; }
 jq --compact-output --null-input --arg version "$version" --argjson start_ms $up --argjson job_ms $took \
   --argjson components "$components" --argjson archive_bytes "$(stat -c %s "$archive")" --argjson frames_bytes "$(stat -c %s "$root/lab/frames.npy")" \
-  '{target: "dist", ok: true, $version, $start_ms, $job_ms, $components, $archive_bytes, $frames_bytes}'
+  --argjson demo_db "$demo" '{target: "dist", ok: true, $version, $start_ms, $job_ms, $demo_db, $components, $archive_bytes, $frames_bytes}'

@@ -73,6 +73,10 @@ def main():
 
 def compare_gif(content, expected):
     """Grey levels are exact; rounding to 16 bits first may differ by one. A frame of colours has 256 of them."""
+    with av.open(io.BytesIO(content)) as movie:
+        stream = movie.streams.video[0]
+        assert stream.codec_context.name == "gif" and stream.average_rate == 10, stream
+        assert sum(1 for _ in movie.decode(stream)) == len(expected)
     with Image.open(io.BytesIO(content)) as movie:
         assert movie.n_frames == len(expected) and movie.info["loop"] == 0
         for index, picture in enumerate(expected):

@@ -251,6 +251,62 @@ async fn every_route_refuses_unknown_query_parameters_and_knows_those_of_the_con
     assert!(checked > 60, "{checked}");
 }
 
+/// A schema of the contract with those that it refers to.
+fn parts(schema: &'static Value) -> Vec<&'static Value> {
+    let place = schema["$ref"].as_str().map(|place| CONTRACT.pointer(&place[1..]).unwrap());
+    let variants = schema["anyOf"].as_array().into_iter().flatten();
+    let inner = place.into_iter().chain(variants).flat_map(parts);
+    [schema].into_iter().chain(inner).collect()
+}
+
+/// The first field of a value that a schema of the contract lacks or misses.
+fn violation(schema: &'static Value, value: &Value, place: &str) -> Option<String> {
+    let parts = parts(schema);
+    match value {
+        Value::Array(items) => {
+            let schema = parts.iter().find_map(|part| part.get("items"))?;
+            items.iter().find_map(|item| violation(schema, item, place))
+        }
+        Value::Object(fields) => {
+            // Requests and tables have free names, and no properties.
+            let known = parts.iter().filter_map(|part| part["properties"].as_object());
+            let known: Vec<_> = known.flatten().collect();
+            // Fields of a variant are not those of the others.
+            let is_plain = parts.iter().all(|part| part["anyOf"].is_null());
+            let required = parts.iter().filter_map(|part| part["required"].as_array());
+            let mut required = required.flatten().filter(|_| is_plain);
+            let missing = required.find(|name| !fields.contains_key(name.as_str().unwrap()));
+            let missing = missing.map(|name| format!("{place} has no {name}"));
+            missing.or_else(|| {
+                fields.iter().filter(|_| !known.is_empty()).find_map(|(name, inner)| {
+                    let place = format!("{place}/{name}");
+                    match known.iter().find(|(other, _)| *other == name) {
+                        Some((_, schema)) => violation(schema, inner, &place),
+                        None => Some(format!("{place} is not in the contract")),
+                    }
+                })
+            })
+        }
+        _ => None,
+    }
+}
+
+#[tokio::test]
+async fn manifests_have_the_fields_of_the_contract() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (_, measurement) = app.scene(&Scene::SMALL).await;
+    for algorithm in ["gap-tv", "gap-tv3d"] {
+        let job = app.submit(&json!({"measurement": measurement, "algorithm": algorithm})).await;
+        assert_eq!(app.ended(&job).await["state"], "succeeded");
+        for (place, schema) in [("", "JobManifest"), ("/snapshots/0", "SnapshotManifest")] {
+            let path = format!("/v1/jobs/{job}{place}/exports/manifest");
+            let manifest = app.get(&path).await.expect(200).json();
+            let schema = &CONTRACT["components"]["schemas"][schema];
+            assert_eq!(violation(schema, &manifest, algorithm), None);
+        }
+    }
+}
+
 /// Each way in takes all inputs and reports all findings: every cell of the table names a test that exists.
 #[test]
 fn every_way_in_has_its_tests() {
@@ -258,7 +314,7 @@ fn every_way_in_has_its_tests() {
     let walks = sources("tests/e2e", &["mjs"]);
     let table = std::fs::read_to_string("tests/WAYS.md").unwrap();
     let rows: Vec<&str> = table.lines().filter(|line| line.starts_with("| ")).skip(2).collect();
-    assert_eq!(rows.len(), 5);
+    assert_eq!(rows.len(), 16);
     for row in rows {
         let cells: Vec<&str> = row.trim_matches('|').split('|').map(str::trim).collect();
         assert_eq!(cells.len(), 8, "{row}");

@@ -52,6 +52,7 @@ mod storm;
 mod upgrade;
 mod uploads;
 mod watching;
+mod ways;
 mod webhooks;
 mod white_level;
 mod work;

@@ -82,11 +82,14 @@ impl Part {
         let inside = |first: usize, length: usize, end: usize| {
             length > 0 && first.checked_add(length).is_some_and(|last| last <= end)
         };
+        let order = all.axes.map_or_else(String::new, |axes| {
+            format!(". Its axes were read as {axes}: state `axes` if they have another order")
+        });
         if !inside(crop.row, crop.height, all.height) || !inside(crop.column, crop.width, all.width)
         {
             let detail = format!(
                 "the window of {}x{} pixels from row {} and column {} on is not inside the pictures of {}x{} (rows x \
-                 columns, counted from 0)",
+                 columns, counted from 0){order}",
                 crop.height, crop.width, crop.row, crop.column, all.height, all.width
             );
             return Err(FormatError::Part { field: "crop", detail });
@@ -94,7 +97,7 @@ impl Part {
         let [first, last] = self.frames.unwrap_or([0, all.frames - 1]);
         if first > last || last >= all.frames {
             let detail = format!(
-                "frames {first} to {last} are not in the file, which has {} frames, counted from 0",
+                "frames {first} to {last} are not in the file, which has {} frames, counted from 0{order}",
                 all.frames
             );
             return Err(FormatError::Part { field: "frames", detail });

@@ -365,7 +365,7 @@ fn over_blocks(
 }
 
 /// Hold-out evidence, from a crop of a measurement, of the error of the whole.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Evidence {
     /// Error estimates from the hold-out pixels.
     pub signs: Signs,

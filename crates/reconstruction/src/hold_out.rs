@@ -65,7 +65,7 @@ impl HoldOut {
 }
 
 /// Squared errors of two predictions of the hold-out pixels.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Prediction {
     /// `||y - H v||^2` over the hold-out pixels.
     pub by_frames: f64,

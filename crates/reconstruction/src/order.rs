@@ -10,7 +10,7 @@ use ndarray::{Array2, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
 
 /// The outcome of the test of a snapshot's order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Order {
     /// Every exchange of two frames makes the steps longer. The reversed order has the same steps.
@@ -20,6 +20,7 @@ pub enum Order {
     /// The masks resemble one another, so the test is impossible.
     SimilarMasks,
     /// An exchange of two frames, counted from 0, makes the steps much shorter.
+    #[schemars(with = "[usize; 2]")]
     Exchanged(usize, usize),
 }
 

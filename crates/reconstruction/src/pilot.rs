@@ -81,7 +81,7 @@ fn candidate(heuristic: Heuristic, value: f32, planned: &Stage, best: &Trial) ->
 }
 
 /// Decisions of the pilot on one stage, with their evidence.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Decided {
     /// The planned stage.
     pub planned: Stage,
@@ -96,7 +96,7 @@ pub struct Decided {
 }
 
 /// Reason for a stage's number of iterations.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize, schemars::JsonSchema)]
 #[strum(serialize_all = "kebab-case")]
 #[serde(rename_all = "kebab-case")]
 pub enum StageEnd {

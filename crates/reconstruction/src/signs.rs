@@ -26,7 +26,7 @@ pub const SIGNS: [&str; 8] = [
 ];
 
 /// Values of [`SIGNS`].
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(transparent)]
 pub struct Signs(pub [f32; SIGNS.len()]);
 

@@ -55,6 +55,7 @@ export class Verdict {
     }
     const { content } = manifest;
     this.assessment = content?.assessment ?? null;
+    put(this.found, findings(findingsOf(job, this.assessment)));
     // Manifests of earlier versions have no verdict.
     this.verdict = content?.verdict === undefined ? job.verdict : content.verdict;
     this.fullScale = manifest.content?.scale.measurement_full_scale ?? 1;
@@ -65,12 +66,12 @@ export class Verdict {
   /** Shows the expected PSNR from the manifest, with its interval and reasons. */
   showExpected() {
     const { psnr_db: psnr } = this.assessment ?? {};
-    const own = findings(findingsOf(this.job, this.assessment).slice(this.job.warnings.length));
     const { order_reason: order } = this.assessment ?? {};
-    put(this.expected, order && h("p", { class: "muted" }, `Order of masks not verifiable: ${order}.`), this.assessment && (psnr === null
-      ? [own, h("p", { class: "muted" }, "No expected PSNR and no map of the expected error: the findings put the scale, the dark or the masks in doubt.")]
+    put(this.expected, this.assessment && (psnr === null
+      ? h("p", { class: "muted" }, "No expected PSNR and no map of the expected error: the findings put the scale, the dark or the masks in doubt.")
       : [h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, aboutDecibels(psnr))),
-          h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`), own]));
+          h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`)]),
+    order && h("p", { class: "muted" }, `Order of masks not verifiable: ${order}.`));
   }
 
   judge(text, kind, why) {

@@ -3,6 +3,7 @@ tifffile.
 
 Each holds the same numbers: masks [3, 4, 5] whose value is (frame + 2 row + 3 column) mod 2, or measurements
 [2, 4, 5] whose value is 100 frame + 10 row + column. `bench73.mat` is a recording of a small camera.
+`../ways` has the inputs of tests/WAYS.md.
 """
 
 import pathlib
@@ -39,7 +40,38 @@ def bench():
         file.write(MATLAB_HEAD)
 
 
+def ways():
+    """Two snapshots that need every option of tests/data/ways/requests.json, as an array of an HDF5 file and as 12-bit pixels.
+
+    The masks are larger than the snapshots of `shots.raw`, of another full scale, more than one exposure shows, and have moved
+    by (2, -1) pixels. The counts contain an offset of the dark, clip from 3500 on, and column 37 of the window is stuck.
+    """
+    folder = HERE.parent / "ways"
+    rng = np.random.default_rng(3)
+    patterns = 1000 * rng.integers(0, 2, (10, 80, 80), np.uint16)
+    moved = np.roll(patterns[1:9], (2, -1), (1, 2)) / 1000
+    frame, row, column = np.indices((16, 80, 80))
+    inside = (row >= 28) & (row < 44) & (column >= 12 + 3 * frame) & (column < 28 + 3 * frame)
+    truth = np.where(inside, 0.95, 0.35 + 0.2 * np.sin(column / 9) * np.cos(row / 13)).reshape(2, 8, 80, 80)
+    dark = (260 + 10 * (np.indices((80, 80))[1] % 9)).astype("<u2")
+    limit = 3500 + rng.integers(0, 60, (2, 80, 80))
+    shots = np.minimum(np.rint(900 * (moved * truth).sum(1)) + dark, limit).astype("<u2")
+    shots[:, :, 45] = 40
+    bad = np.zeros((64, 64), np.uint8)
+    bad[:, 37] = 1
+    with h5py.File(folder / "bench.h5", "w") as file:
+        for name, values in [("optics/patterns", np.moveaxis(patterns, 0, -1)), ("camera/shots", shots.transpose(2, 1, 0))]:
+            file.create_dataset(name, data=values, chunks=values.shape, compression="gzip", shuffle=True)
+    np.save(folder / "dark.npy", dark)
+    np.save(folder / "bad.npy", bad)
+    for name, pixels in [("shots", shots), ("dark", dark)]:
+        first, second = (pixels[..., 8:72, 8 + side : 72 : 2] for side in (0, 1))
+        packed = np.stack([first & 255, first >> 8 | (second & 15) << 4, second >> 4], -1)
+        packed.astype(np.uint8).tofile(folder / f"{name}.raw")
+
+
 def main():
+    ways()
     frame, row, column = np.indices((3, 4, 5))
     masks = (frame + 2 * row + 3 * column) % 2
     frame, row, column = np.indices((2, 4, 5))

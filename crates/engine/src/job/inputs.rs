@@ -1,5 +1,6 @@
 //! The requests and the files that determine a result, as manifests record them and as jobs are repeated from them.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -7,7 +8,7 @@ use super::{CalibrationRequest, JobId, MeasurementRequest, Sha256};
 use reconstruction::registration::Correction;
 
 /// The origin of masks.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MaskInputs {
     /// The file of the masks: the upload, or the npy file of masks that the service has made.
     pub masks_sha256: Sha256,
@@ -22,7 +23,7 @@ pub struct MaskInputs {
 }
 
 /// Masks that the registration of a job has corrected.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CorrectedMasks {
     pub job: JobId,
     #[serde(flatten)]
@@ -35,7 +36,7 @@ pub struct CorrectedMasks {
 }
 
 /// The origin of snapshots.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 pub struct MeasurementInputs {
     /// Order of the axes in which the measurement was read; null for pictures.
     pub measurement_axes: Option<String>,
@@ -44,7 +45,7 @@ pub struct MeasurementInputs {
 }
 
 /// The inputs of a job.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 pub struct Inputs {
     #[serde(flatten)]
     pub masks: MaskInputs,

@@ -35,7 +35,7 @@ pub struct ModelFacts {
 }
 
 /// A network as jobs and manifests record it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct ModelRecord {
     pub name: String,
     /// SHA-256 of the concatenated ONNX files.

@@ -66,7 +66,18 @@ impl<'de> Visitor<'de> for RequestVisitor {
     }
 }
 
+/// Findings of a measurement's check on masks that have moved since the calibration.
+const DRIFT: [FindingCode; 3] =
+    [FindingCode::DriftedMasks, FindingCode::ShiftedMasks, FindingCode::ForeignMasks];
+/// The part of [`DRIFT`] that a stated motion answers. Nothing has tested this motion against masks of another camera.
+const MOTION: &[FindingCode] = DRIFT.split_at(2).0;
+
 impl RegistrationRequest {
+    /// Findings of the measurement's check that a job answers as it moves the masks. They do not count before its end.
+    pub fn answers(self) -> &'static [FindingCode] {
+        if matches!(self, Self::Stated(_)) { MOTION } else { &[] }
+    }
+
     /// True for the default.
     pub(super) fn is_auto(&self) -> bool {
         *self == Self::Auto
@@ -185,12 +196,9 @@ impl Registered {
     /// Findings of the measurement's check that do not apply to masks that the job has moved. If these still do not fit, the
     /// frames do not explain the hold-out pixels.
     pub fn superseded(&self) -> &'static [FindingCode] {
-        const DRIFT: [FindingCode; 3] =
-            [FindingCode::DriftedMasks, FindingCode::ShiftedMasks, FindingCode::ForeignMasks];
         match (self.applied, self.uncertainty.is_some(), self.explains) {
             (true, true, _) => &DRIFT,
-            // Nothing has tested a stated motion against masks of another camera.
-            (true, false, Some(true) | None) => &DRIFT[..2],
+            (true, false, Some(true) | None) => MOTION,
             (false, ..) | (true, false, Some(false)) => &[],
         }
     }

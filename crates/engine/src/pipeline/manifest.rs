@@ -6,6 +6,7 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, Axis};
+use schemars::JsonSchema;
 use serde::{Serialize, Serializer};
 use serde_json::{Map, Value};
 
@@ -31,7 +32,7 @@ const SNAPSHOT_SCHEMA: &str = "sci-recon/snapshot/1";
 const JOB_SCHEMA: &str = "sci-recon/job/1";
 
 /// The part that the manifests of a job and of its snapshots share.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 pub struct Recipe {
     pub program_version: &'static str,
     pub algorithm: Algorithm,
@@ -47,14 +48,17 @@ pub struct Recipe {
     pub models: Vec<ModelRecord>,
     pub scale: ScaleRecord,
     #[serde(serialize_with = "tile_plan")]
+    #[schemars(with = "TilePlanRecord")]
     pub tile_plan: TilePlan,
     /// The planned runs of snapshots. The pilot may have cut some of them.
     #[serde(serialize_with = "runs")]
+    #[schemars(with = "Vec<[usize; 2]>")]
     pub runs: SequencePlan,
     /// Findings of the check of the measurement against its calibration.
     pub warnings: Vec<Finding>,
     /// The size, which is not serialised here, and the mosaic with the demosaicking method; null for a grey sensor.
     #[serde(rename = "colour", serialize_with = "colour")]
+    #[schemars(with = "Option<ColourRecord>")]
     pub shape: SceneShape,
     /// Displacement of the bands of a spectral camera; null for frames of a video.
     pub dispersion: Option<Dispersion>,
@@ -63,27 +67,30 @@ pub struct Recipe {
     pub camera: (Option<f64>, Option<f64>),
 }
 
-/// Serialises size and overlap, and the positions of the tiles as \[row, column, height, width\] in the plan's order.
-/// Behind a mosaic the size counts pixels of a sub-image, and four tiles, one of each sub-image, share a position.
-fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::Error> {
-    #[derive(Serialize)]
-    struct Record {
-        size: usize,
-        overlap: usize,
-        tiles: Vec<[usize; 4]>,
-    }
-    let tiles = plan.tiles().map(|tile| tile.place()).collect();
-    Record { size: plan.size(), overlap: plan.overlap(), tiles }.serialize(serializer)
+/// The tiles of a job. Behind a mosaic the size counts pixels of a sub-image, and four tiles, one of each sub-image, share a
+/// position.
+#[derive(Serialize, JsonSchema)]
+struct TilePlanRecord {
+    size: usize,
+    overlap: usize,
+    /// Positions of the tiles as \[row, column, height, width\] in the plan's order.
+    tiles: Vec<[usize; 4]>,
 }
 
-/// Serialises the mosaic of the sensor and the demosaicking method.
+fn tile_plan<S: Serializer>(plan: &TilePlan, serializer: S) -> Result<S::Ok, S::Error> {
+    let tiles = plan.tiles().map(|tile| tile.place()).collect();
+    TilePlanRecord { size: plan.size(), overlap: plan.overlap(), tiles }.serialize(serializer)
+}
+
+/// The mosaic of the sensor and the demosaicking method.
+#[derive(Serialize, JsonSchema)]
+struct ColourRecord {
+    mosaic: Mosaic,
+    demosaicking: &'static str,
+}
+
 fn colour<S: Serializer>(shape: &SceneShape, serializer: S) -> Result<S::Ok, S::Error> {
-    #[derive(Serialize)]
-    struct Record {
-        mosaic: Mosaic,
-        demosaicking: &'static str,
-    }
-    let record = |mosaic| Record { mosaic, demosaicking: Mosaic::DEMOSAICKING };
+    let record = |mosaic| ColourRecord { mosaic, demosaicking: Mosaic::DEMOSAICKING };
     shape.mosaic.map(record).serialize(serializer)
 }
 
@@ -225,7 +232,8 @@ pub struct JobTasks {
 }
 
 /// The manifest of a snapshot, `manifest.json`.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
+#[schemars(rename = "SnapshotManifest")]
 pub struct Manifest {
     schema: &'static str,
     pub content: Content,
@@ -233,7 +241,8 @@ pub struct Manifest {
 }
 
 /// The part of a manifest that depends only on inputs, parameters and arithmetic.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
+#[schemars(rename = "SnapshotContent")]
 pub struct Content {
     #[serde(flatten)]
     pub recipe: Recipe,
@@ -256,7 +265,7 @@ pub struct Content {
 
 /// All factors between stored values and the unit scale of the solver. Frames are on the scale of the measurement
 /// divided by its full scale: the normalisation is undone. The full scale of the masks defines a mask value of 1.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, JsonSchema)]
 pub struct ScaleRecord {
     /// Stored mask value that means 1.
     pub masks_full_scale: f32,
@@ -270,7 +279,7 @@ pub struct ScaleRecord {
 }
 
 /// The timing of the camera.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 pub struct CameraRecord {
     /// Snapshots per second.
     pub fps: Option<f64>,
@@ -312,14 +321,14 @@ impl CameraRecord {
 }
 
 /// The manifest of a job.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 pub struct JobManifest {
     schema: &'static str,
     content: JobContent,
     run: JobRun,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct JobContent {
     #[serde(flatten)]
     recipe: Recipe,
@@ -329,7 +338,7 @@ struct JobContent {
     snapshots: Vec<SnapshotEntry>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct SnapshotEntry {
     snapshot: u32,
     summary: TileRecord,
@@ -339,7 +348,7 @@ struct SnapshotEntry {
     files: Vec<ResultFile>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct JobRun {
     #[serde(flatten)]
     run: RunRecord,

@@ -1,5 +1,6 @@
 //! Records of a job's tasks, for later tasks and for the manifests.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -28,7 +29,7 @@ pub struct WhiteRecord {
 }
 
 /// The decisions of a job's pilot.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PilotRecord {
     pub snapshot: usize,
     pub row: usize,
@@ -66,7 +67,7 @@ impl PilotRecord {
 }
 
 /// The pilot's decision on the joint between two snapshots.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct JointRecord {
     /// Index of the snapshot before the joint.
     pub after: usize,
@@ -104,7 +105,7 @@ pub fn changes(decided: &Decided) -> String {
 }
 
 /// The iterations of a tile, or the largest values and the common reason of several tiles.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct TileRecord {
     /// Iterations of all stages.
     pub iterations: usize,
@@ -160,7 +161,7 @@ pub struct TileTaskRecord {
 }
 
 /// Cost of a computation, and the runtime that performed it.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CostRecord {
     /// Execution provider of the network. `None` without a network.
     pub provider: Option<String>,
@@ -187,7 +188,7 @@ impl CostRecord {
     }
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunRecord {
     /// The job. `None` on the command line.
     pub job: Option<String>,

@@ -59,7 +59,7 @@ const DEPTH: f64 = 6.0;
 const APART: f64 = 3.0;
 
 /// A correction of masks that have moved since their calibration.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
 pub struct Correction {
     /// The motion of the masks.
     pub motion: Similarity,

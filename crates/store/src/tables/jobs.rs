@@ -7,8 +7,8 @@ use crate::columns::{Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Page, Span};
 use engine::job::{
-    Assessment, CalibrationId, Grade, JobId, JobSpec, JobState, Lab, Label, MeasurementId, Sha256,
-    Timestamp,
+    Assessment, CalibrationId, Finding, Grade, JobId, JobSpec, JobState, Lab, Label, MeasurementId,
+    Sha256, Timestamp,
 };
 
 #[derive(Debug, Clone, PartialEq)]
@@ -27,11 +27,20 @@ pub struct Job {
 }
 
 impl Job {
-    /// The verdict on its frames. Before its end only findings count; a job without a result has none.
+    /// The verdict on its frames. Before its end only findings count that the job does not answer itself; a job without a
+    /// result has none.
     pub fn verdict(&self) -> Option<Grade> {
-        let has_no_result = matches!(self.state, JobState::Failed | JobState::Cancelled);
-        let verdict = Assessment::verdict(&self.spec.warnings, self.assessment.as_ref());
-        verdict.filter(|_| !has_no_result)
+        let Self { spec, state, assessment, .. } = self;
+        let findings = match state {
+            JobState::Failed | JobState::Cancelled => return None,
+            JobState::Succeeded => spec.warnings.clone(),
+            JobState::Queued | JobState::Running | JobState::Cancelling => {
+                let answered = spec.registration.answers();
+                let remains = |finding: &&Finding| !answered.iter().any(|code| finding.is(*code));
+                spec.warnings.iter().filter(remains).cloned().collect()
+            }
+        };
+        Assessment::verdict(&findings, assessment.as_ref())
     }
 
     /// The verdict in a line; `None` until it has succeeded.
