@@ -9,8 +9,6 @@
 
 mod layout;
 mod low_rank;
-#[cfg(feature = "gpu")]
-mod on_gpu;
 mod search;
 mod temporal_shrinkage;
 
@@ -23,7 +21,7 @@ use super::{Family, Networks, Prior, Size, Spec, WorkingSet, noise_levels};
 use crate::cores::{Cores, share_with};
 use crate::error::Result;
 #[cfg(feature = "gpu")]
-use crate::gpu::nonlocal::Clip;
+use crate::gpu::nonlocal::{Clip, Levels};
 use crate::motion::Motion;
 use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
 use low_rank::{BATCH_VALUES, Filter};
@@ -116,7 +114,7 @@ impl Spec for NonlocalSpec {
         if let Some(gpu) = networks.gpu()? {
             let clip = Clip::new(gpu, size, nonlocal.temporal_shrinkage.cosines())?;
             let shrinkage = self.temporal_shrinkage;
-            return Ok(Box::new(on_gpu::OnGpu { clip, settings: nonlocal, shrinkage }));
+            return Ok(Box::new(OnGpu { clip, settings: nonlocal, shrinkage }));
         }
         Ok(Box::new(NonlocalPrior { nonlocal, shrinkage: self.temporal_shrinkage }))
     }
@@ -130,6 +128,49 @@ struct NonlocalPrior {
 impl Prior for NonlocalPrior {
     fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
         self.nonlocal.denoise(frames, sigma, self.shrinkage);
+        Ok(())
+    }
+}
+
+/// The prior with its clip on a GPU, and the settings of the prior on the CPU.
+#[cfg(feature = "gpu")]
+struct OnGpu {
+    clip: Clip,
+    settings: Nonlocal,
+    shrinkage: f32,
+}
+
+#[cfg(feature = "gpu")]
+impl Prior for OnGpu {
+    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
+        let Self { clip, settings, shrinkage } = self;
+        let size: Size = frames.dim();
+        if size.1 < SIDE || size.2 < SIDE {
+            return Ok(());
+        }
+        let levels = Levels {
+            margin: settings.outlier_limit * sigma,
+            shrinkage: *shrinkage * sigma,
+            tau: STRENGTH * PATCHES as f32 * sigma * sigma,
+        };
+        let mut values: Vec<f32> = frames.iter().copied().collect();
+        clip.load(&values, levels);
+        if settings.passes == 0 {
+            clip.guide_by_frames();
+        }
+        if settings.passes.is_multiple_of(REFRESH) {
+            let motion = if settings.motion_compensation {
+                let guide = clip.guide()?;
+                let guide = ArrayView3::from_shape(size, &guide).expect("a clip");
+                Motion::of(guide, &settings.cores)
+            } else {
+                Motion::none()
+            };
+            clip.search(&search::windows(size, settings.passes / REFRESH, &motion))?;
+        }
+        settings.passes += 1;
+        clip.filter(levels, &mut values)?;
+        frames.iter_mut().zip(values).for_each(|(frame, value)| *frame = value);
         Ok(())
     }
 }
