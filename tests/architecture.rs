@@ -377,6 +377,21 @@ fn the_check_detects_circles() {
     assert!(files[&module("a::d")].foreign.contains("std::fs"));
 }
 
+/// A program without the feature `gpu` is built without these libraries.
+#[test]
+fn libraries_of_the_gpu_are_optional() {
+    let text = fs::read_to_string("crates/reconstruction/Cargo.toml").unwrap();
+    let manifest: toml::Table = text.parse().unwrap();
+    for name in ["pollster", "wgpu"] {
+        let optional = manifest["dependencies"][name].get("optional");
+        assert_eq!(optional.and_then(toml::Value::as_bool), Some(true), "{name}");
+    }
+    let features = manifest["features"].as_table().unwrap();
+    assert!(features.get("default").is_none(), "{features:?}");
+    let root: toml::Table = fs::read_to_string("Cargo.toml").unwrap().parse().unwrap();
+    assert!(root["features"].get("default").is_none());
+}
+
 #[test]
 fn the_version_and_its_date_are_the_same_everywhere() {
     let text = |path: &str| fs::read_to_string(path).unwrap();

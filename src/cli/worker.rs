@@ -200,3 +200,33 @@ async fn abandoned() {
     let mut stdin = tokio::io::stdin();
     while !matches!(stdin.read(&mut sink).await, Ok(0) | Err(_)) {}
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::{Device, PathBuf, WorkerArguments, model_command};
+
+    #[derive(Debug, Parser)]
+    struct Command {
+        #[command(flatten)]
+        worker: WorkerArguments,
+    }
+
+    #[test]
+    fn networks_of_users_run_on_the_gpu_only_without_confinement() {
+        let command = |options: &[&str]| {
+            let line = [&["test", "--data", "data", "--device", "gpu"], options].concat();
+            let settings = Command::try_parse_from(line).unwrap().worker;
+            model_command(&settings, PathBuf::from("program"))
+        };
+        for (options, device) in [(&[][..], "cpu"), (&["--unconfined"][..], "gpu")] {
+            let model = command(options);
+            assert_eq!(model.provider, Device::parse(device).unwrap().provider());
+            for line in [model.run, model.check] {
+                assert_eq!(line[1..3], ["--device", device]);
+                assert_eq!(line.iter().any(|word| word == "--unconfined"), !options.is_empty());
+            }
+        }
+    }
+}

@@ -83,18 +83,9 @@ def kustomize(root, wrong, program):
         file = folder / "kustomization.yaml"
         text = yaml.safe_load(file.read_text())
         text["images"] = [{**image, **IMAGE} for image in text["images"]]
-        file.write_text(yaml.safe_dump(text))
-        status, output = run("kubectl", "kustomize", str(folder))
-    if status:
-        wrong.append(f"kubectl kustomize: {output}")
-        return None
-    documents = list(yaml.safe_load_all(output))
-    kinds = [each["kind"] for each in documents]
-    if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
-        wrong.append(f"kubectl kustomize creates {kinds}")
-    wrong += [f"kubectl kustomize: {reason}" for reason in unresolved(documents)]
-    for name, _, template in templates(documents):
-        wrong += [f"kubectl kustomize: {name}: {reason}" for reason in unrestricted(template["spec"])]
+        for components in ([], ["gpu"]):
+            file.write_text(yaml.safe_dump({**text, "components": components}))
+            wrong += [f"kubectl kustomize {components}: {reason}" for reason in rendered(folder, bool(components))]
     return None
 
 
@@ -131,6 +122,38 @@ def unrestricted(pod):
             "seLinuxOptions": not container_context.get("seLinuxOptions"),
         }
         yield from (f"{container['name']}: {name}" for name, kept in rules.items() if not kept)
+
+
+def rendered(folder, has_gpu):
+    """Faults of the objects of a folder."""
+    status, output = run("kubectl", "kustomize", str(folder))
+    if status:
+        yield output
+        return
+    documents = list(yaml.safe_load_all(output))
+    kinds = [each["kind"] for each in documents]
+    if sorted(kinds) != ["Namespace", *["ScaledJob"], *["Secret"] * 3, *["Service"] * 2, *["StatefulSet"] * 2]:
+        yield f"it creates {kinds}"
+    yield from unresolved(documents)
+    for name, document, template in templates(documents):
+        yield from (f"{name}: {reason}" for reason in unrestricted(template["spec"]))
+        if document["kind"] == "ScaledJob":
+            yield from wrong_device(template["spec"], has_gpu)
+            spec = document["spec"]["jobTargetRef"]
+            job = {"apiVersion": "batch/v1", "kind": "Job", "metadata": {"name": name}, "spec": spec}
+            try:
+                kubernetes_validate.validate(job, VERSION, strict=True)
+            except kubernetes_validate.ValidationError as error:
+                yield f"{name}: {error.message}"
+
+
+def wrong_device(pod, has_gpu):
+    """Faults of the device of a worker."""
+    [container] = pod["containers"]
+    device = {each["name"]: each["value"] for each in container.get("env", [])}.get("SCI_RECON_DEVICE", "cpu")
+    count = container["resources"]["limits"].get("nvidia.com/gpu", "0")
+    if (device, count) != (("gpu", "1") if has_gpu else ("cpu", "0")):
+        yield f"a worker has the device {device} and {count} GPUs"
 
 
 def templates(documents):

@@ -8,7 +8,7 @@ use wgpu::{
     Backends, Buffer, BufferDescriptor, BufferUsages, CommandEncoder, ComputePipeline,
     ComputePipelineDescriptor, Device, DeviceDescriptor, DeviceLostReason, ErrorFilter, Instance,
     InstanceDescriptor, InstanceFlags, Limits, MapMode, PollType, PowerPreference, Queue,
-    RequestAdapterOptions, include_wgsl,
+    RequestAdapterOptions, ShaderModule, include_wgsl,
 };
 
 use crate::error::{ReconError, Result};
@@ -28,6 +28,12 @@ pub(super) struct Kernels {
     pub(super) variation_along_time: ComputePipeline,
     pub(super) variation: ComputePipeline,
     pub(super) finish: ComputePipeline,
+    pub(super) limit_outliers: ComputePipeline,
+    pub(super) analyse: ComputePipeline,
+    pub(super) shrink: ComputePipeline,
+    pub(super) search: ComputePipeline,
+    pub(super) low_rank: ComputePipeline,
+    pub(super) aggregate: ComputePipeline,
 }
 
 /// A failure that the driver reports outside of calls.
@@ -89,21 +95,30 @@ impl Gpu {
             fault.get_or_insert_with(|| Fault::Other(error.to_string()));
         }));
         let module = device.create_shader_module(include_wgsl!("kernels.wgsl"));
-        let kernel = |name| {
+        let nonlocal = device.create_shader_module(include_wgsl!("nonlocal.wgsl"));
+        let kernel_of = |module: &ShaderModule, name| {
             device.create_compute_pipeline(&ComputePipelineDescriptor {
                 label: Some(name),
                 layout: None,
-                module: &module,
+                module,
                 entry_point: Some(name),
                 compilation_options: Default::default(),
                 cache: None,
             })
         };
+        let kernel = |name| kernel_of(&module, name);
+        let nonlocal = |name| kernel_of(&nonlocal, name);
         let kernels = Kernels {
             project: kernel("project"),
             variation_along_time: kernel("variation_along_time"),
             variation: kernel("variation"),
             finish: kernel("finish"),
+            limit_outliers: nonlocal("limit_outliers"),
+            analyse: nonlocal("analyse"),
+            shrink: nonlocal("shrink"),
+            search: nonlocal("search"),
+            low_rank: nonlocal("low_rank"),
+            aggregate: nonlocal("aggregate"),
         };
         let gpu = Self { name, device, queue, kernels, fault };
         gpu.check()?;

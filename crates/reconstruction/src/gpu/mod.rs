@@ -1,7 +1,9 @@
-//! Iterations with total variation on a GPU of any vendor. The kernels are in `kernels.wgsl`.
+//! Iterations with total variation, and the nonlocal prior, on a GPU of any vendor. The kernels are in `kernels.wgsl` and
+//! `nonlocal.wgsl`.
 
 pub mod adapter;
+pub(crate) mod nonlocal;
 pub(crate) mod resident;
 pub mod speed;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

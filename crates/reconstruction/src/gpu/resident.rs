@@ -14,7 +14,7 @@ use crate::projection::{Problem, Settings, Step};
 
 // These constants are repeated in `kernels.wgsl`.
 /// Lanes of a workgroup.
-const GROUP: usize = 256;
+pub(super) const GROUP: usize = 256;
 /// Largest number of iterations between two reads of their sums.
 const BATCH: usize = 32;
 /// Position of the first part of a sum.
@@ -288,7 +288,7 @@ fn dispatches(updates: usize) -> Vec<usize> {
 }
 
 /// Workgroups in two dimensions, at least `count`.
-fn grid(count: usize) -> [u32; 3] {
+pub(super) fn grid(count: usize) -> [u32; 3] {
     let columns = (count as u32).min(MAX_GROUPS);
     [columns, (count as u32).div_ceil(columns), 1]
 }

@@ -23,7 +23,7 @@ use crate::{admm, gap};
 const TOLERANCE: f64 = 1e-4;
 
 /// Networks of a machine with this GPU.
-struct On(Arc<Gpu>);
+pub(crate) struct On(pub(crate) Arc<Gpu>);
 
 impl Networks for On {
     fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser> {
@@ -40,7 +40,7 @@ fn is_missing(error: &ReconError) -> bool {
 }
 
 /// The GPU of this machine. Without one, tests pass, except in CI.
-fn gpu() -> Option<Arc<Gpu>> {
+pub(crate) fn gpu() -> Option<Arc<Gpu>> {
     static GPU: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
     let open = || match Gpu::open() {
         Ok(gpu) => Some(Arc::new(gpu)),

@@ -4,6 +4,8 @@ use std::ops::Range;
 
 use pulp::{Simd, bytemuck};
 
+#[cfg(feature = "gpu")]
+use crate::gpu::nonlocal::{NONE, Windows};
 use crate::motion::Motion;
 
 use super::layout::{PATCHES, REACH, SIDE, WINDOW, positions, row_length, shift};
@@ -106,6 +108,31 @@ fn search_with<S: Simd, const V: usize>(
         group.iter_mut().zip(best.places().cycle()).for_each(|(slot, place)| *slot = place);
         group.sort_unstable();
     }
+}
+
+/// The search windows of all references, in the order of their groups, for clips without margins.
+#[cfg(feature = "gpu")]
+pub(super) fn windows(size: Size, searches: usize, motion: &Motion) -> Windows {
+    let (frames, height, width) = size;
+    let mut places = Vec::new();
+    for Line { frame, row, columns } in lines(size, searches) {
+        for column in columns {
+            let place = |frame: usize, row: usize, column: usize| {
+                ((frame * height + row) * width + column) as u32
+            };
+            let by = motion.at(row + SIDE / 2, column + SIDE / 2);
+            let searched = frame.saturating_sub(REACH)..frames.min(frame + REACH + 1);
+            let mut group = [NONE; 2 * REACH + 2];
+            group[0] = place(frame, row, column);
+            for (slot, other) in group[1..].iter_mut().zip(searched) {
+                let top = window(moved(row, by.0, frame, other), height).start;
+                let left = window(moved(column, by.1, frame, other), width).start;
+                *slot = place(other, top, left);
+            }
+            places.push(group);
+        }
+    }
+    Windows { size: (window(0, height).len(), window(0, width).len()), places }
 }
 
 /// Position in another frame of an object at `at` that moves by `by` pixels per frame.

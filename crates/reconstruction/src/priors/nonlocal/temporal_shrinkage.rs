@@ -39,6 +39,12 @@ impl TemporalShrinkage {
         Self { frames, height, width, cosines, rows: ring, squares, excess }
     }
 
+    /// The DCT-II without its first row.
+    #[cfg(feature = "gpu")]
+    pub(super) fn cosines(&self) -> &[f32] {
+        &self.cosines
+    }
+
     /// Multiplies each coefficient by `g = e^2 / (e^2 + level^4)`, where `e` is the mean of its square over 5x5
     /// pixels, cut at the edges. `level` is above 0. `clip` has frame after frame, row by row, with at least
     /// `row_length` values in a row.
