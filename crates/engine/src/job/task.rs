@@ -11,8 +11,8 @@ use reconstruction::{ReconError, crop, joints, preview};
 
 /// CPU seconds per voxel that is read (measured).
 const READ_S: f64 = 12e-9;
-/// CPU seconds per frame of the registration of masks on its piece of fixed size. Median of `make eval-registration`.
-const REGISTRATION_S: f64 = 0.07;
+/// CPU seconds per frame of the registration of masks on pieces of fixed size. Median of `make eval-registration` with rotation and growth.
+const REGISTRATION_S: f64 = 0.16;
 /// CPU seconds per voxel that is blended and written in all formats (measured).
 const WRITE_S: f64 = 110e-9;
 /// CPU seconds per voxel of a preview by blocks (measured).

@@ -283,7 +283,8 @@ struct Search<'a> {
 
 impl<'a> Search<'a> {
     fn new(plan: &'a Plan, first: Piece, proceed: &'a mut dyn FnMut(f64) -> bool) -> Self {
-        let runs = STEPS.len() * 9 + 2 * MAX_GRIDS * (9 + 2 * Interpolation::ALL.len()) + 3;
+        let interpolations = Interpolation::ALL.len();
+        let runs = (STEPS.len() + 2 * MAX_GRIDS + interpolations - 1) * 9 + 4 * interpolations + 3;
         let grids = LOCAL_GRIDS.iter().sum::<usize>();
         let others = plan.others.first().map_or(0, |others| 9 * grids * (1 + others.len()));
         let total = (2 * plan.reach() + 1).pow(2) * ITERATIONS.0 + (runs + others) * ITERATIONS.1;
@@ -448,7 +449,7 @@ impl<'a> Search<'a> {
     /// Fits ever finer grids until each has settled, and tries the other interpolations at the end: a motion that is a little
     /// wrong favours smooth ones, and these bias it. `None` if a reconstruction diverges.
     fn settle(&mut self, best: Correction, free: Free) -> Result<Option<(Correction, Fit)>> {
-        let Some(settled) = self.refine(best, free, true)? else { return Ok(None) };
+        let Some(settled) = self.refine(best, free)? else { return Ok(None) };
         if settled.0.motion.is_whole() {
             return Ok(Some(settled));
         }
@@ -467,24 +468,15 @@ impl<'a> Search<'a> {
             }
         }
         let Some(better) = better else { return Ok(Some(settled)) };
-        Ok(self.refine(better, free, false)?.or(Some(settled)))
+        Ok(self.refine(better, free)?.or(Some(settled)))
     }
 
-    /// Fits ever finer grids until each has settled. If `chooses`, the interpolation is chosen again for each grid. `None` if a
-    /// reconstruction diverges.
-    fn refine(
-        &mut self,
-        mut best: Correction,
-        free: Free,
-        chooses: bool,
-    ) -> Result<Option<(Correction, Fit)>> {
+    /// Fits ever finer grids until each has settled. `None` if a reconstruction diverges.
+    fn refine(&mut self, mut best: Correction, free: Free) -> Result<Option<(Correction, Fit)>> {
         let mut last = None;
         let mut steps = LAST_STEPS.into_iter().peekable();
         for _ in 0..MAX_GRIDS {
             let Some(step) = steps.peek() else { break };
-            if chooses {
-                best.interpolation = self.interpolation(best.motion)?;
-            }
             let Some(grids) = self.grids(best, *step)? else { return Ok(None) };
             let fit = self.fit(best, &grids, *step, free);
             best.motion = fit.minimum;
