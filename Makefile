@@ -91,10 +91,11 @@ $(JUDGES)/.stamp: tests/judges/requirements.txt
 	$(JUDGES)/bin/python -m pip install --quiet --requirement $<
 	touch $@
 
-faults: runtime ## test 200 random kills (also during uploads, calibrations, deletions and backups), faults at file operations, damaged data
+faults: runtime ## test 200 random kills (also during uploads, calibrations, deletions and backups), faults at file operations, damaged data, attacks; needs nats-server
 	SCI_RECON_KILLS=200 SCI_RECON_FAULT_POINTS=25 $(PYTHON) scripts/figures.py faults \
 		$(CARGO) test --release --test service -- --nocapture faults:: crashes:: damage:: hangs:: resumable:: identity:: \
-		copies:: limits:: conditions:: storm::
+		copies:: limits:: conditions:: storm:: \
+		access:: audit:: confinement:: downloads:: hostile::
 
 load: ## test 200 clients that poll for five minutes, then 20 concurrent uploads of 600 MB (12 GB of disk)
 	$(PYTHON) scripts/figures.py load \

@@ -12,7 +12,9 @@ use super::CliError;
 use super::arguments::NetworkArguments;
 use super::output::print_line;
 use crate::cli::error::Result;
-use engine::job::{Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec};
+use engine::job::{
+    Algorithm, ModelFacts, ModelTensor, ModelTrial, ModelVerdict, TileSpec, shortened_reason,
+};
 use engine::pipeline::networks::{ModelFile, NetworkError, NetworkSource};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use reconstruction::ReconError;
@@ -75,7 +77,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         ModelFile::open(&arguments.file).map_err(|error| CliError::Input(error.to_string()))?;
     let verdict = match facts(arguments, &network, &file) {
         Ok(facts) => ModelVerdict::Fits(facts),
-        Err(NetworkError::Runtime(error)) => ModelVerdict::Refused(error.to_string()),
+        Err(NetworkError::Runtime(error)) => {
+            ModelVerdict::Refused(shortened_reason(&error.to_string()))
+        }
         Err(other) => return Err(other.into()),
     };
     let text = serde_json::to_string(&verdict).map_err(|error| refused(&error))?;

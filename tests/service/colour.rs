@@ -1,5 +1,6 @@
 //! Colour sensors: from a colour clip through a mosaic to frames in colour.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -281,6 +282,52 @@ async fn workers_and_the_command_line_give_the_same_colours() {
         let (id, _) = run(&app).await;
         assert_eq!(results_of(&app, &id, SNAPSHOTS).await, expected);
     }
+}
+
+#[tokio::test]
+async fn a_mosaic_leaves_out_what_was_not_measured_here_and_elsewhere() {
+    let lab = Lab::coloured("gbrg");
+    let y = lab.file("measurement.npy");
+    let mut sorted = values(&y);
+    sorted.sort_by(f32::total_cmp);
+    let clip = sorted[sorted.len() * 95 / 100];
+    let file = crate::defects::spoiled(&y, &[SNAPSHOTS, SIDE, SIDE], clip);
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let truth = app.upload(lab.file("truth.npy")).await;
+    let whole = lab.measure(&app, "gbrg").await;
+    let calibration = id(&lab.calibrate(&app, "gbrg").await);
+    let measurement = app.measure(&calibration, file).await.expect(201).json();
+    for code in ["bad_pixels", "saturated"] {
+        let mut warnings = measurement["warnings"].as_array().unwrap().iter();
+        assert!(warnings.any(|warning| warning["code"] == code), "{measurement:#}");
+    }
+    let measurement = measurement["id"].as_str().unwrap();
+    let mut quality = Vec::new();
+    let mut expected = BTreeMap::new();
+    for measurement in [whole.as_str(), measurement] {
+        let job = app.submit(&tv(measurement)).await;
+        assert_eq!(app.ended(&job).await["state"], "succeeded");
+        for snapshot in 0..SNAPSHOTS {
+            let base = format!("/v1/jobs/{job}/snapshots/{snapshot}");
+            let frames = app.get(&format!("{base}/exports/npy")).await.expect(200).bytes;
+            assert!(values(&frames).iter().all(|value| value.is_finite()));
+            let path = format!("{base}/quality?truth={truth}");
+            let report = app.get(&path).await.expect(200).json();
+            let unit = 20.0 * report["peak"].as_f64().unwrap().log10();
+            quality.push(report["psnr"].as_f64().unwrap() - unit);
+        }
+        expected = results_of(&app, &job, SNAPSHOTS).await;
+    }
+    let (before, after) = quality.split_at(SNAPSHOTS);
+    eprintln!("{after:.2?} dB, {before:.2?} dB if all is measured");
+    assert!(before.iter().zip(after).all(|(before, after)| after > &(before - 4.0)), "{quality:?}");
+    let Some(nats) = Nats::start(1) else { return };
+    let url = nats.url();
+    let app = app.again(&["--workers", "0", "--nats", &url, "--ack-wait", "5"]).await;
+    let _worker = RemoteWorker::start(&["--nats", &url, "--pool", "test"]);
+    let job = app.submit(&tv(measurement)).await;
+    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    assert_eq!(results_of(&app, &job, SNAPSHOTS).await, expected);
 }
 
 #[tokio::test]

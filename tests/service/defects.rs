@@ -5,7 +5,10 @@ use std::process::Command;
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
-use crate::pipeline::values;
+use crate::cluster::nodes::{Nats, RemoteWorker};
+use crate::faults::results_of;
+use crate::learned;
+use crate::pipeline::{psnr, values};
 use crate::samples::{Scene, npy, npy_header};
 
 const SCENE: Scene = Scene { frames: 8, height: 64, width: 96, snapshots: 1 };
@@ -169,4 +172,136 @@ async fn the_service_leaves_out_what_was_not_measured() {
         let brightest = frames.iter().copied().fold(0.0, f32::max);
         assert!(brightest < 1.5, "snapshot {snapshot}: {brightest}");
     }
+}
+
+/// True for the pixels that [`spoiled`] takes from a snapshot.
+fn is_lost(at: usize) -> bool {
+    at % 307 == 11
+}
+
+/// Snapshots without some pixels, on a sensor that saturates at `clip`.
+pub fn spoiled(file: &[u8], shape: &[usize], clip: f32) -> Vec<u8> {
+    let values = values(file).into_iter().enumerate();
+    npy(shape, values.map(|(at, y)| if is_lost(at) { f32::NAN } else { y.min(clip) }))
+}
+
+/// All frames of a job, snapshot by snapshot.
+async fn frames_of(app: &TestApp, job: &str, snapshots: usize) -> Vec<Vec<f32>> {
+    let mut all = Vec::new();
+    for snapshot in 0..snapshots {
+        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/npy");
+        all.push(values(&app.get(&path).await.expect(200).bytes));
+    }
+    all
+}
+
+async fn succeeded(app: &TestApp, body: &Value) -> String {
+    let job = app.submit(body).await;
+    let ended = app.ended(&job).await;
+    assert_eq!(ended["state"], "succeeded", "{ended:#}");
+    job
+}
+
+#[tokio::test]
+async fn sequences_and_networks_leave_out_what_was_not_measured_here_and_elsewhere() {
+    let Some(python) = learned::python() else { return };
+    let scene = Scene { snapshots: 3, ..Scene::SMALL };
+    let shape = [scene.snapshots, scene.height, scene.width];
+    let app = TestApp::with(&["--workers", "2"]).await;
+    let (calibration, whole) = app.scene(&scene).await;
+    let file = spoiled(&scene.snapshots(), &shape, 2.5);
+    let measurement = app.measure(&calibration, file).await.expect(201).json();
+    let warnings = codes(&measurement["warnings"]);
+    assert!(warnings.contains(&"bad_pixels") && warnings.contains(&"saturated"), "{warnings:?}");
+    let folder = tempfile::tempdir().unwrap();
+    let network = learned::train(&python, folder.path(), scene, "free");
+    let model = id(&learned::register(&app, &calibration, &network).await.expect(201));
+
+    let denoised = json!({"stages": [
+        {"prior": "tv", "iterations": 20, "tv_weight": 0.1},
+        {"prior": "ffdnet", "iterations": 3, "sigma": [0.2, 0.05]}]});
+    let joint = json!({"stages": [
+        {"prior": "tv", "iterations": 20, "tv_weight": 0.1, "temporal_weight": 0.004},
+        {"prior": "nonlocal", "iterations": 4, "sigma": [0.2, 0.02], "memory": 0.6}]});
+    let bodies = [
+        json!({"algorithm": "pnp-nonlocal", "schedule": joint}),
+        json!({"algorithm": "gap-tv3d"}),
+        json!({"algorithm": "pnp-ffdnet", "schedule": denoised}),
+        json!({"algorithm": "learned", "model": model}),
+    ];
+    let of = |body: &Value, measurement: &Value| {
+        let mut body = body.clone();
+        body["measurement"] = measurement.clone();
+        body["tile"] = json!({"size": 40, "overlap": 8});
+        body
+    };
+    let mut expected = Vec::new();
+    for body in &bodies {
+        let name = &body["algorithm"];
+        let complete = succeeded(&app, &of(body, &json!(whole))).await;
+        let job = succeeded(&app, &of(body, &measurement["id"])).await;
+        let before = frames_of(&app, &complete, scene.snapshots).await;
+        let after = frames_of(&app, &job, scene.snapshots).await;
+        for (snapshot, (before, after)) in before.iter().zip(&after).enumerate() {
+            assert!(after.iter().all(|value| value.is_finite()), "{name}");
+            let (before, after) = (psnr(scene, snapshot, before), psnr(scene, snapshot, after));
+            eprintln!(
+                "{name}, snapshot {snapshot}: {after:.2} dB, {before:.2} dB if all is measured"
+            );
+            // A third of the bright square is saturated.
+            assert!(after > before - 5.0, "{name}, snapshot {snapshot}: {after} dB, {before} dB");
+        }
+        expected.push(results_of(&app, &job, scene.snapshots).await);
+    }
+    let Some(nats) = Nats::start(1) else { return };
+    let url = nats.url();
+    let app = app.again(&["--workers", "0", "--nats", &url, "--ack-wait", "5"]).await;
+    let _workers = [(); 2].map(|()| RemoteWorker::start(&["--nats", &url, "--pool", "test"]));
+    for (body, expected) in bodies.iter().zip(&expected) {
+        let job = succeeded(&app, &of(body, &measurement["id"])).await;
+        let found = results_of(&app, &job, scene.snapshots).await;
+        assert_eq!(found, *expected, "{}", body["algorithm"]);
+    }
+}
+
+/// A network knows no missing pixels, so it gets the mean of their neighbours.
+#[tokio::test]
+async fn a_network_gets_the_mean_of_the_neighbours() {
+    let Some(python) = learned::python() else { return };
+    let scene = Scene { snapshots: 1, ..Scene::SMALL };
+    let (height, width) = (scene.height, scene.width);
+    let shape = [1, height, width];
+    let y = values(&scene.snapshots());
+    let mean = |at: usize| {
+        let around = |at: usize, length: usize| at.saturating_sub(1)..length.min(at + 2);
+        let (row, column) = (at / width, at % width);
+        let square = around(row, height)
+            .flat_map(|row| around(column, width).map(move |column| row * width + column));
+        let known: Vec<f32> = square.filter(|near| *near != at).map(|near| y[near]).collect();
+        known.iter().sum::<f32>() / known.len() as f32
+    };
+    let with = |lost: &dyn Fn(usize) -> f32| {
+        npy(&shape, (0..y.len()).map(|at| if is_lost(at) { lost(at) } else { y[at] }))
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let network = learned::train(&python, folder.path(), scene, "fixed");
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let (calibration, _) = app.scene(&scene).await;
+    let model = id(&learned::register(&app, &calibration, &network).await.expect(201));
+    let mut results = Vec::new();
+    for file in [with(&|_| f32::NAN), with(&mean), with(&|_| 0.0)] {
+        let measurement = app.measure(&calibration, file).await.expect(201).json();
+        let body =
+            json!({"measurement": measurement["id"], "algorithm": "learned", "model": model});
+        let job = succeeded(&app, &body).await;
+        results.push((measurement, frames_of(&app, &job, 1).await.remove(0)));
+    }
+    let codes = codes(&results[0].0["warnings"]);
+    assert!(codes.contains(&"bad_pixels"), "{codes:?}");
+    let far = |other: usize| {
+        let pairs = results[0].1.iter().zip(&results[other].1);
+        pairs.map(|(one, other)| (one - other).abs()).fold(0.0, f32::max)
+    };
+    eprintln!("largest difference: {} from the means, {} from zeros", far(1), far(2));
+    assert!(far(1) < 0.02, "{}", far(1));
 }

@@ -5,10 +5,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use rustix::process::{Signal, kill_process};
+use engine::pipeline::usage::peak_rss_of;
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::{Value, json};
 
 use crate::app::{TestApp, id};
+use crate::faults::children;
 use crate::samples::Scene;
 
 /// Builds a library with this body of its entry point.
@@ -22,6 +24,10 @@ pub fn library(folder: &Path, body: &str) -> PathBuf {
     let status = cc.args(["-shared", "-fPIC", "-o"]).arg(&library).arg(&source).status().unwrap();
     assert!(status.success());
     library
+}
+
+fn number(process: &Pid) -> u32 {
+    process.as_raw_nonzero().get().unsigned_abs()
 }
 
 fn deep(measurement: &str) -> Value {
@@ -105,6 +111,34 @@ async fn hanging_networks_delay_no_other_work_and_are_refused() {
         assert!(detail.contains("one run of the network takes more than"), "{detail}");
     }
     assert_eq!(app.get("/v1/models").await.json()["items"], json!([]));
+}
+
+#[tokio::test]
+async fn a_network_that_floods_its_output_is_refused_with_little_memory() {
+    let flood = "static char block[1 << 20]; for (int i = 0; i < 512; i++)
+        for (size_t done = 0; done < sizeof block;) {
+            ssize_t n = write(1 + i % 2, block + done, sizeof block - done);
+            if (n < 0) _exit(7);
+            done += n;
+        }
+        abort();";
+    let (_folder, app) = with_library(flood, "60").await;
+    let (calibration, measurement) = app.scene(&Scene::SMALL).await;
+    let job = json!({"measurement": measurement, "algorithm": "gap-tv"});
+    assert_eq!(app.ended(&app.submit(&job).await).await["state"], "succeeded");
+    let workers = || children(app.pid()).iter().map(number).collect();
+    let processes = || [vec![app.pid()], workers()].concat();
+    let before = processes();
+    let peaks = |of: &[u32]| of.iter().map(|one| peak_rss_of(*one) >> 20).collect::<Vec<_>>();
+    let first = peaks(&before);
+    let file = app.upload(b"one".to_vec()).await;
+    let refused = app.post("/v1/models", &json!({"calibration": calibration, "file": file})).await;
+    let detail = refused.problem(422, "invalid_content");
+    assert!(detail.contains("SIGABRT"), "{detail}");
+    assert_eq!(processes(), before, "no process has ended");
+    let then = peaks(&before);
+    eprintln!("peak memory before {first:?} MiB, after {then:?} MiB");
+    assert!(first.iter().zip(&then).all(|(first, then)| then - first < 32), "{first:?} {then:?}");
 }
 
 #[tokio::test]

@@ -10,16 +10,16 @@ use std::time::{Duration, Instant};
 use super::model_process::ModelCommand;
 use super::transport::TaskError;
 use engine::intake::{IntakeError, Refusal, RefusalCode};
-use engine::job::{ModelFacts, ModelVerdict, TaskStage, without_paths};
+use engine::job::{ModelFacts, ModelVerdict, TaskStage, shortened_reason, without_paths};
 use engine::pipeline::progress::Monitor;
 use store::NewCalibration;
 
 /// Time between polls of the process.
 const POLL: Duration = Duration::from_millis(20);
-/// Longest reason that is shown, in characters.
-const MAX_REASON: usize = 2000;
+/// Number of bytes that are kept of each output of the process. A verdict has a few kilobytes.
+const MAX_OUTPUT: u64 = 1 << 20;
 
-/// The exit status and the output of a process.
+/// The exit status and the first [`MAX_OUTPUT`] bytes of each output of a process.
 struct Exit {
     status: ExitStatus,
     stdout: Vec<u8>,
@@ -38,10 +38,10 @@ pub(super) fn run(
     let start = Instant::now();
     let exit = run_until(command_line(command, file, masks), deadline, monitor)
         .map_err(|error| TaskError::Transport(error.into()))?;
-    // A network may contain names of any length.
-    let cut = |why: String| without_paths(&why).chars().take(MAX_REASON).collect::<String>();
-    let refused =
-        |why: String| Ok(Err(Refusal::new(RefusalCode::InvalidContent, cut(why)).at("/file")));
+    let refused = |why: String| {
+        let why = without_paths(&shortened_reason(&why));
+        Ok(Err(Refusal::new(RefusalCode::InvalidContent, why).at("/file")))
+    };
     let Some(Exit { status, stdout, stderr }) = exit else {
         if monitor.stopped() {
             return Err(IntakeError::Stopped.into());
@@ -62,7 +62,7 @@ pub(super) fn run(
         Ok(ModelVerdict::Fits(facts)) => Ok(Ok(facts)),
         Ok(ModelVerdict::Refused(why)) => refused(why),
         Err(_) => {
-            let output = String::from_utf8_lossy(&stderr);
+            let output = shortened_reason(&String::from_utf8_lossy(&stderr));
             tracing::error!(%output, %status, "a network can't be checked");
             let detail = "the service can't run networks now; its log has the reason";
             Ok(Err(Refusal::new(RefusalCode::Unavailable, detail)))
@@ -96,8 +96,11 @@ fn run_until(
     std::thread::scope(|scope| {
         let read = |pipe: Option<&mut dyn Read>| {
             let mut bytes = Vec::new();
-            // The bytes before a read error suffice.
-            pipe.map(|pipe| pipe.read_to_end(&mut bytes));
+            if let Some(mut pipe) = pipe {
+                // The bytes before a read error suffice. The rest is read too, so that the process is not blocked.
+                let _ = (&mut pipe).take(MAX_OUTPUT).read_to_end(&mut bytes);
+                let _ = std::io::copy(&mut pipe, &mut std::io::sink());
+            }
             bytes
         };
         let stdout = scope.spawn(move || read(output.as_mut().map(|pipe| pipe as _)));

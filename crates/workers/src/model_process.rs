@@ -15,7 +15,7 @@ use std::time::Duration;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 use serde::{Deserialize, Serialize};
 
-use engine::job::Sha256;
+use engine::job::{Sha256, shortened_reason};
 use engine::pipeline::PipelineError;
 use engine::pipeline::networks::{ModelFile, NetworkSource};
 use engine::pipeline::progress::Monitor;
@@ -284,11 +284,11 @@ pub fn answer_worker(source: &NetworkSource) -> io::Result<()> {
                     *network = Some(loaded);
                     (Answer::Loaded, None)
                 }
-                Err(error) => (Answer::Failed(error.to_string()), None),
+                Err(error) => (Answer::Failed(shortened_reason(&error.to_string())), None),
             },
             (Task::Run(y, masks), Some(network)) => match network.frames(y.view(), masks.view()) {
                 Ok(frames) => (Answer::Frames, Some(frames)),
-                Err(error) => (Answer::Failed(error.to_string()), None),
+                Err(error) => (Answer::Failed(shortened_reason(&error.to_string())), None),
             },
             (Task::Run(..), None) => (Answer::Failed("no network is loaded".into()), None),
         };

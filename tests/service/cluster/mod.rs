@@ -96,6 +96,25 @@ async fn busy(app: &TestApp) {
     .await;
 }
 
+/// `sync_interval: always` keeps messages through a power cut. Servers before 2.10 reject it.
+#[test]
+fn the_configuration_suits_the_version_of_the_message_server() {
+    for (version, is_known) in [("2.9.25", false), ("2.10", true), ("2.12.5", true)] {
+        let folder = tempfile::tempdir().unwrap();
+        let keys = folder.path().join("keys");
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_sci-recon"));
+        command.args(["cluster", "init", "--nats-version", version, "--keys"]).arg(&keys);
+        // The configuration is for servers elsewhere, so none of this machine tests it.
+        let output = command.env("NATS_SERVER", "/nowhere").env("PATH", "").output().unwrap();
+        let warnings = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{warnings}");
+        let text = std::fs::read_to_string(keys.join("nats-server.conf")).unwrap();
+        let is_set = text.lines().any(|line| line.trim() == "sync_interval: always");
+        assert_eq!(is_set, is_known, "{version}: {text}");
+        assert_eq!(warnings.contains("a power cut may lose"), !is_known, "{version}: {warnings}");
+    }
+}
+
 #[tokio::test]
 async fn a_job_on_remote_workers_gives_the_same_bytes() {
     let Some(nats) = Nats::start(1) else { return };

@@ -30,7 +30,9 @@ pub use ids::{
     WorkerId,
 };
 pub use inputs::{CorrectedMasks, Inputs, MaskInputs, MeasurementInputs, fields};
-pub use model::{JobModel, ModelFacts, ModelRecord, ModelTensor, ModelTrial, ModelVerdict};
+pub use model::{
+    JobModel, ModelFacts, ModelRecord, ModelTensor, ModelTrial, ModelVerdict, shortened_reason,
+};
 pub use optics::{Dispersion, DispersionAxis, MARGIN, MaskExtent, Mosaic};
 pub use pool::Pool;
 pub use reading::{Reading, ScaleBasis, keeps_mosaic};

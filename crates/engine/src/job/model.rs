@@ -52,6 +52,15 @@ pub enum ModelVerdict {
     Refused(String),
 }
 
+/// Longest reason why a network can't be used, in characters.
+const MAX_REASON: usize = 2000;
+
+/// Shortens the reason why a network can't be used. A network may contain names of any length.
+#[must_use]
+pub fn shortened_reason(reason: &str) -> String {
+    reason.chars().take(MAX_REASON).collect()
+}
+
 /// The network of a job with the algorithm [`Algorithm::Learned`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct JobModel {

@@ -1,15 +1,18 @@
 //! A database is copied before a migration, and one of another version is refused.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions, Connection, SqliteConnection};
 use strum::VariantArray;
 use tempfile::TempDir;
 
+use super::keeping::walk;
 use crate::migrations::Schema;
 use crate::{Purpose, Store, StoreError};
-use engine::job::TaskState;
+use engine::job::{Lab, TaskState, Timestamp};
 
 const SERVE: Purpose = Purpose::Serve { accept_database: false };
 const ACCEPT: Purpose = Purpose::Serve { accept_database: true };
@@ -77,6 +80,45 @@ async fn the_database_is_saved_before_it_is_brought_up_to_date() {
     open_next(folder.path(), add).await.unwrap().close().await;
     assert_eq!(saved(folder.path()).len(), 1);
     assert_ne!(saved(folder.path()), copies);
+}
+
+/// A file that the copy of the database knows outlives its deletion until the update is old.
+#[tokio::test]
+async fn deleted_files_are_kept_for_a_return_to_the_copy() {
+    let (folder, store) = served().await;
+    let upload = async |store: &Store, bytes: &[u8]| {
+        let mut writer = store.blob_writer().unwrap();
+        writer.write_all(bytes).unwrap();
+        let staged = writer.finish().unwrap();
+        store.store_upload(&Lab::local(), None, staged).await.unwrap();
+        // The times of files and of the update have milliseconds.
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    };
+    upload(&store, b"before").await;
+    store.close().await;
+    drop(store);
+    let add = "ALTER TABLE jobs ADD COLUMN mood TEXT";
+    let store = open_next(folder.path(), add).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(20)).await;
+    upload(&store, b"after").await;
+    let soon = || Timestamp(Timestamp::now().0 + 1000);
+    assert_eq!(store.collect(soon()).await.unwrap().len(), 2, "both uploads are deleted");
+    assert!(walk(&folder.path().join("blobs")).is_empty());
+    let kept = folder.path().join("before-updates/kept");
+    let contents = || -> Vec<Vec<u8>> {
+        walk(&kept).iter().map(|file| std::fs::read(file).unwrap()).collect()
+    };
+    assert_eq!(contents(), [b"before"], "the copy knows only the first file");
+
+    assert!(!store.release_kept(Timestamp(Timestamp::now().0 - 60_000)).await.unwrap());
+    assert_eq!(contents(), [b"before"], "the update is younger than a minute");
+    assert!(store.release_kept(soon()).await.unwrap());
+    assert!(!kept.exists());
+    assert!(!store.release_kept(soon()).await.unwrap(), "no file is left");
+    // From then on, deleted files are not kept.
+    upload(&store, b"later").await;
+    store.collect(soon()).await.unwrap();
+    assert!(!kept.exists() && saved(folder.path()).len() == 1);
 }
 
 #[tokio::test]
