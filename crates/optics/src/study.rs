@@ -314,7 +314,8 @@ impl PixelCounts {
                 continue;
             }
             let bright = value > 0.5;
-            self.closed += u64::from(value <= 0.0);
+            // As in the Gram diagonal: the square of a tiny value is 0.
+            self.closed += u64::from(value.max(0.0).powi(2) == 0.0);
             self.open += u64::from(value > STUCK_PIXEL);
             self.bright += u64::from(bright);
             self.edges += u64::from(previous.is_some_and(|previous| previous != bright));

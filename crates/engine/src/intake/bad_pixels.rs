@@ -31,5 +31,10 @@ pub fn bad_pixels(
     }
     let map = reader.next_frame().map_err(IntakeError::format(PLACE))?;
     let map = map.ok_or_else(|| FormatError::Internal("a map without its frame".into()))?;
-    Ok(map.mapv(|value| value != 0.0))
+    let bad = map.mapv(|value| value != 0.0);
+    if bad.iter().all(|bad| *bad) {
+        let detail = "the map marks every pixel as bad; it must be 0 where a pixel is good, so it may be inverted";
+        return Err(IntakeError::content(PLACE, &detail));
+    }
+    Ok(bad)
 }

@@ -402,13 +402,12 @@ impl<'a> Search<'a> {
                     None => drop(self.pieces.remove(grids.len())),
                 }
             }
+            // Farther pieces show rotations that are too small for neighbours.
             let fit = self.fit(best, &grids, fine, Free::All);
-            has_turned |= fit.has_turned;
-            // If neighbours do not turn, farther pieces are not read.
-            if !has_turned {
-                return Ok(None);
+            if fit.has_turned {
+                has_turned = true;
+                best.motion = fit.minimum;
             }
-            best.motion = fit.minimum;
         }
         if !has_turned {
             return Ok(None);

@@ -219,6 +219,6 @@ async fn a_deletion_that_is_broken_off_leaves_no_job_without_files() {
             break;
         }
     }
-    assert!(deleted > 1 && left > 1, "{deleted} {left}");
+    assert!(deleted > 0 && left > 0, "{deleted} {left}");
     assert_eq!(lab.store.quarantine_orphans(false).await.unwrap(), 0);
 }
