@@ -188,15 +188,7 @@ async fn masks_that_code_only_one_direction_are_not_good() {
     let values = (0..8).flat_map(|k| (0..64 * 80).map(move |at| noise(k, at / 80)));
     let calibration = id(&app.calibrate(npy(&[8, 64, 80], values)).await.expect(201));
     let path = format!("/v1/calibrations/{calibration}/report");
-    let mut report = app.get(&path).await;
-    for _ in 0..200 {
-        if report.status == 200 {
-            break;
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-        report = app.get(&path).await;
-    }
-    let report = report.expect(200).json();
+    let report = app.get_until(&path, 200).await.json();
     assert_ne!(report["grade"], "good");
     let findings = report["findings"].as_array().unwrap();
     let finding_found = findings.iter().find(|finding| finding["code"] == "one_dimensional");
