@@ -65,6 +65,7 @@ TOOLS := $(VENV)/tools
 dist: release wheel $(TOOLS)/bin/cargo-cyclonedx ## make the relocatable archive dist/sci-recon-VERSION-MACHINE-linux.tar.gz, its list of components (SBOM), the Python client, and checksums
 	@rm -rf dist/$(ARCHIVE) && scripts/install.sh "$(PROGRAM)" dist/$(ARCHIVE) /usr/local
 	@cp README.md CHANGELOG.md LICENSE openapi.yaml dist/$(ARCHIVE)/
+	@mkdir dist/$(ARCHIVE)/scripts && cp scripts/fetch-onnxruntime.sh dist/$(ARCHIVE)/scripts/
 	@tar --create --exclude 'deploy/kubernetes/cluster' --exclude '*.creds' docs deploy docker | tar --extract --directory dist/$(ARCHIVE)
 	@tar --create --gzip --file dist/$(ARCHIVE).tar.gz --directory dist --owner 0 --group 0 $(ARCHIVE)
 	@$(TOOLS)/bin/cargo-cyclonedx cyclonedx --quiet --format json --spec-version 1.5 --target all --override-filename components

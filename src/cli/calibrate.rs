@@ -22,6 +22,9 @@ pub struct Arguments {
     /// Files are named relative to it; each holds one frame or several repeats.
     #[arg(long, value_name = "FILE")]
     captures: PathBuf,
+    /// A picture of the size of the captures that is not 0 at bad pixels. They are left out.
+    #[arg(long, value_name = "FILE")]
+    bad_pixels: Option<PathBuf>,
     /// Folder for masks.npy, report.json, report.html and maps/.
     #[arg(long, value_name = "FOLDER")]
     out: PathBuf,
@@ -59,8 +62,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let file = file.map_err(FormatError::io("write masks.npy"))?;
         npy::writer(BufWriter::new(file), (info.frames, info.height, info.width), Channels::Grey)
     };
-    let calibrated =
-        calibrate((&files, None), &Limits::default(), scratch.path(), masks, &mut share);
+    let from = (&files, arguments.bad_pixels.as_deref());
+    let calibrated = calibrate(from, &Limits::default(), scratch.path(), masks, &mut share);
     let (calibrated, _) = calibrated.map_err(|error| match error.is_retryable() {
         // Includes failures to write.
         true => CliError::Failure(error.to_string()),

@@ -12,7 +12,7 @@ use super::CliError;
 use super::client::Client;
 use super::error::{Result, open_input};
 use super::submission::{PlainArguments, create_calibration};
-use engine::job::Sha256;
+use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256};
 
 /// Schema of the manifest of a job.
 const SCHEMA: &str = "sci-recon/job/1";
@@ -49,14 +49,16 @@ pub(super) struct Manifest {
 struct Run {
     label: Option<String>,
     truth_sha256: Option<Sha256>,
-    calibration: String,
-    measurement: String,
-    model: Option<String>,
+    calibration: CalibrationId,
+    measurement: MeasurementId,
+    model: Option<ModelId>,
 }
 
 /// The requests that repeat the inputs of a job.
 #[derive(Debug, Deserialize)]
 struct Inputs {
+    #[serde(default)]
+    masks_sha256: Option<Sha256>,
     calibration: Map<String, Value>,
     measurement: Map<String, Value>,
 }
@@ -141,14 +143,33 @@ impl Manifest {
         plain: &PlainArguments,
         key: &str,
     ) -> Result<Value> {
-        let Inputs { calibration, mut measurement } = self.read_part("inputs")?;
+        let Inputs { masks_sha256, calibration, mut measurement } = self.read_part("inputs")?;
         let mut job: Map<String, Value> = self.read_part("request")?;
-        let Run { label, truth_sha256: truth, .. } = &self.run;
-        let masks = Input::new(client, "calibrations", Some(&self.run.calibration)).await?;
+        // A manifest may come from a stranger, and its webhook with it.
+        job.remove("webhook");
+        let Run { label, truth_sha256: truth, calibration: id, .. } = &self.run;
+        let mut stated = calibration.clone();
+        stated.insert("masks".to_owned(), json!(masks_sha256));
+        let masks = Input::find(client, "calibrations", id.to_string(), &stated).await?;
         let masks = masks.made_of(uploads("masks", &calibration));
-        let data = Input::new(client, "measurements", Some(&self.run.measurement)).await?;
+        let mut stated = measurement.clone();
+        stated.insert("calibration".to_owned(), json!(id));
+        let data = match &masks.existing {
+            Some(_) => {
+                let id = self.run.measurement.to_string();
+                Input::find(client, "measurements", id, &stated).await?
+            }
+            None => Input::default(),
+        };
         let data = data.made_of(uploads("measurement", &measurement));
-        let network = Input::new(client, "models", self.run.model.as_ref()).await?;
+        let network = match (&masks.existing, self.run.model, self.network()) {
+            (Some(calibration), Some(id), Some(file)) => {
+                let stated = json!({"calibration": calibration, "file": file});
+                let stated = stated.as_object().cloned().unwrap_or_default();
+                Input::find(client, "models", id.to_string(), &stated).await?
+            }
+            _ => Input::default(),
+        };
         let network = network.made_of(self.network().map(|sha256| ("network".to_owned(), sha256)));
         let inputs = [&masks, &data, &network];
         let all = inputs.iter().flat_map(|input| &input.uploads);
@@ -241,6 +262,7 @@ impl Manifest {
 }
 
 /// A calibration, measurement or model of a job.
+#[derive(Default)]
 struct Input {
     /// The identifier, if the service has it.
     existing: Option<String>,
@@ -249,21 +271,38 @@ struct Input {
 }
 
 impl Input {
-    /// Looks for an input by its identifier.
-    async fn new(client: &Client, kind: &str, id: Option<&String>) -> Result<Self> {
-        let found = match id {
-            Some(id) => client.find(&format!("/v1/{kind}/{id}")).await?,
-            None => None,
-        };
+    /// Looks for an input by its identifier. It must be ready, and agree with the request that is `stated` to have made it.
+    async fn find(
+        client: &Client,
+        kind: &str,
+        id: String,
+        stated: &Map<String, Value>,
+    ) -> Result<Self> {
+        let found = client.find(&format!("/v1/{kind}/{id}")).await?;
         // A model has no state.
         let is_ready = |found: &Value| found["state"].as_str().is_none_or(|state| state == "ready");
-        let existing = found.filter(is_ready).and(id.cloned());
+        let existing = found.filter(|found| is_ready(found) && agrees(stated, found)).map(|_| id);
         Ok(Self { existing, uploads: Vec::new() })
     }
 
     fn made_of(self, uploads: impl IntoIterator<Item = (String, Sha256)>) -> Self {
         Self { uploads: uploads.into_iter().collect(), ..self }
     }
+}
+
+/// True if a resource has all values of a request that it repeats. Names are free.
+fn agrees(stated: &Map<String, Value>, found: &Value) -> bool {
+    let differs = |was: &Value, is: &Value| {
+        #[allow(clippy::cast_possible_truncation)] // a scale has 32 bits
+        match (was.as_f64(), is.as_f64()) {
+            (Some(was), Some(is)) => was as f32 != is as f32,
+            _ => was != is,
+        }
+    };
+    stated.iter().filter(|(name, was)| *name != "name" && !was.is_null()).all(|(name, was)| {
+        let is = found.get(name).or_else(|| found.get("reading")?.get(name));
+        is.is_none_or(|is| !differs(was, is))
+    })
 }
 
 /// The comparison of a job's frames with a manifest.
@@ -416,7 +455,10 @@ mod tests {
                 "request": {"tile": {"size": size}},
                 "snapshots": snapshots,
             },
-            "run": {"calibration": "c", "measurement": "m"},
+            "run": {
+                "calibration": "0190a9b8-0000-7000-8000-000000000001",
+                "measurement": "0190a9b8-0000-7000-8000-000000000002",
+            },
         })
     }
 

@@ -130,6 +130,9 @@ codes! {
         "Workers were killed or stopped responding. Make sure that they keep running, then retry the job.";
     MovieFailed: StatusCode::INTERNAL_SERVER_ERROR, "Movie can't be encoded", false,
         "A worker has tried three times; the detail has the reason. To try again, create the movie again.";
+    ReportFailed: StatusCode::INTERNAL_SERVER_ERROR, "Report can't be made", false,
+        "The workers have tried as often as they may; the detail has the reason. The masks are stored, and jobs can \
+         use them. To try again, create the calibration again.";
     FileDamaged: StatusCode::INTERNAL_SERVER_ERROR, "Stored file is damaged", false,
         "The file is lost or damaged on the disk of the service, so it is not sent. Retry its job to create the \
          file again.";

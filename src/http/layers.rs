@@ -20,6 +20,7 @@ use tower_http::set_header::SetResponseHeaderLayer;
 
 use super::context::relative;
 use super::error::{ApiError, Code};
+use super::negotiation::weighted;
 use store::Store;
 
 /// Bytes from which on compression saves more than its header costs.
@@ -80,9 +81,23 @@ pub(super) fn compression() -> CompressionLayer<And<SizeAbove, IsText>> {
     CompressionLayer::new().compress_when(SizeAbove::new(COMPRESSED_FROM).and(is_text))
 }
 
+/// Removes refusals of plain content from `Accept-Encoding`. A server may ignore them (RFC 9110, 12.5.3). The layer of
+/// compression would answer 406 after the request has had its effect.
+fn admit_plain_content(headers: &mut HeaderMap) {
+    let admitted: Vec<String> = weighted(headers, header::ACCEPT_ENCODING)
+        .filter(|(name, weight)| *weight > 0.0 || !matches!(name.as_str(), "identity" | "*"))
+        .map(|(name, weight)| format!("{name};q={weight}"))
+        .collect();
+    match HeaderValue::try_from(admitted.join(", ")) {
+        Ok(value) if !admitted.is_empty() => drop(headers.insert(header::ACCEPT_ENCODING, value)),
+        _ => drop(headers.remove(header::ACCEPT_ENCODING)),
+    }
+}
+
 /// Distinguishes the ETags of compressed answers, because strong ETags differ between encodings (RFC 9110, 8.8.3.3).
 /// Handlers know the ETags of the plain content alone.
 pub(super) async fn encoded_tags(mut request: Request, next: Next) -> Response {
+    admit_plain_content(request.headers_mut());
     let mut knows_packed = false;
     for (name, value) in request.headers_mut() {
         let is_condition = name == header::IF_MATCH || name == header::IF_NONE_MATCH;
@@ -93,8 +108,13 @@ pub(super) async fn encoded_tags(mut request: Request, next: Next) -> Response {
         }
     }
     let mut response = next.run(request).await;
-    let is_known = response.status() == StatusCode::NOT_MODIFIED && knows_packed;
+    let is_unmodified = response.status() == StatusCode::NOT_MODIFIED;
+    let is_known = is_unmodified && knows_packed;
     let fields = response.headers_mut();
+    if is_unmodified {
+        // A 304 has the `Vary` of the content (RFC 9110, 15.4.5).
+        fields.append(header::VARY, HeaderValue::from_static("accept-encoding"));
+    }
     if (is_known || fields.contains_key(header::CONTENT_ENCODING))
         && let Some(tag) = fields.get(header::ETAG).and_then(|tag| tag.to_str().ok())
         && let Ok(tag) = format!("{}{PACKED}", tag.trim_end_matches('"')).try_into()

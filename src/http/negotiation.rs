@@ -6,7 +6,10 @@ use super::error::{ApiError, Code, Result};
 use formats::display::Encoding;
 
 /// The items of a list header with their weights from 0 to 1, in lower case and without other parameters.
-fn weighted(headers: &HeaderMap, name: HeaderName) -> impl Iterator<Item = (String, f32)> {
+pub(super) fn weighted(
+    headers: &HeaderMap,
+    name: HeaderName,
+) -> impl Iterator<Item = (String, f32)> {
     let lists = headers.get_all(name).iter().filter_map(|value| value.to_str().ok());
     lists.flat_map(|list| list.split(',')).filter_map(|item| {
         let mut parts = item.split(';').map(|part| part.trim().to_ascii_lowercase());

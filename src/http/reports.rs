@@ -57,7 +57,16 @@ pub(super) async fn map(
 async fn report(app: &App, lab: &Lab, id: CalibrationId) -> Result<CalibrationReport> {
     // Checks first that the calibration belongs to the lab.
     app.store.calibration(lab, id).await?;
-    let not_yet =
-        || ApiError::new(Code::NotReady, "the report is not ready yet; try again in a few seconds");
-    app.store.report(id).await?.ok_or_else(not_yet)
+    if let Some(report) = app.store.report(id).await? {
+        return Ok(report);
+    }
+    Err(match app.store.report_failure(id).await? {
+        Some(reason) => {
+            let detail = format!("the report of the calibration can't be made: {reason}");
+            ApiError::new(Code::ReportFailed, detail)
+        }
+        None => {
+            ApiError::new(Code::NotReady, "the report is not ready yet; try again in a few seconds")
+        }
+    })
 }

@@ -204,11 +204,15 @@ fn the_command_line_calibrates_like_the_service() {
     let lab = Lab::new("");
     let index = lab.folder.path().join("sim/captures/captures.json");
     let out = lab.folder.path().join("calibration");
+    let map = lab.folder.path().join("bad.npy");
+    let first_row = |at: usize| f32::from(u8::from(at < SIDE));
+    std::fs::write(&map, npy(&[SIDE, SIDE], (0..SIDE * SIDE).map(first_row))).unwrap();
     let run = |index: &Path| {
         let line =
             ["calibrate".as_ref(), "--json".as_ref(), "--captures".as_ref(), index.as_os_str()];
         Command::new(env!("CARGO_BIN_EXE_sci-recon"))
             .args(line)
+            .args(["--bad-pixels".as_ref(), map.as_os_str()])
             .args(["--out".as_ref(), out.as_os_str()])
             .output()
             .unwrap()
@@ -220,6 +224,9 @@ fn the_command_line_calibrates_like_the_service() {
     let masks = values(&std::fs::read(out.join("masks.npy")).unwrap());
     assert_eq!(masks.len(), FRAMES * SIDE * SIDE);
     assert_eq!(masks.iter().copied().fold(0.0, f32::max), 1.0);
+    for (at, mask) in masks.iter().enumerate() {
+        assert_eq!(mask.is_nan(), at % (SIDE * SIDE) < SIDE, "{at}");
+    }
     for file in ["report.json", "report.html", "maps/gram.png"] {
         assert!(out.join(file).is_file(), "{file}");
     }
@@ -334,8 +341,20 @@ async fn invalid_captures_are_rejected() {
     let detail = refused.problem(409, "calibration_not_ready");
     assert!(detail.contains("nowhere brighter"), "{detail}");
     assert_eq!(refused.json()["retryable"], false, "a failed calibration is never ready");
+    // Squares of such differences are 0 in 32 bits.
+    let (height, width) = (96, 96);
+    let faint = |value: f32| npy(&[height, width], (0..height * width).map(move |_| value));
+    let mut faintly = good.clone();
+    for (name, value) in [("white", 1e-40), ("black", 0.0), ("black_with_mask", 0.0)] {
+        if !faintly[name].is_null() {
+            faintly[name] = json!([app.upload(faint(value)).await]);
+        }
+    }
+    let refused = app.calibrate_captures(&faintly).await;
+    let error = refused["error"].as_str().unwrap();
+    assert!(error.contains("brighter than black by only"), "{error}");
     let listed = app.get("/v1/calibrations").await.expect(200).json();
-    assert_eq!(listed["items"][0]["state"], "failed");
+    assert_eq!(listed["items"][1]["state"], "failed");
     let path = format!("/v1/calibrations/{}", failed["id"].as_str().unwrap());
     app.delete(&path).await.expect(204);
     app.get(&path).await.problem(404, "not_found");

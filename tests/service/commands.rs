@@ -533,6 +533,23 @@ async fn a_manifest_repeats_a_job_and_names_what_is_missing() {
     assert!(different.contains("different from the manifest"), "{different}");
     assert!(different.contains("request.tile.size is 32"), "{different}");
 
+    // A manifest that names another measurement, and a webhook, repeats the inputs that it has hashes of.
+    let inputs = ["dark.npy", "--masks", "masks.npy", "--algorithm", "gap-tv"];
+    let (another, _) = done(&lab, &[&["submit"], &inputs[..]].concat()).await;
+    let another = app.get(&format!("/v1/jobs/{another}")).await.expect(200).json();
+    let mut forged: Value = serde_json::from_slice(&std::fs::read(manifest).unwrap()).unwrap();
+    forged["run"]["measurement"] = another["measurement"].clone();
+    forged["content"]["request"]["webhook"] = json!("https://lab.example/hook");
+    lab.write("forged.json", forged.to_string().as_bytes());
+    let (again, _) = done(&lab, &["submit", "--manifest", "forged.json"]).await;
+    let job = app.get(&format!("/v1/jobs/{again}")).await.expect(200).json();
+    assert_ne!(job["measurement"], another["measurement"]);
+    assert_eq!(job["webhook"], Value::Null);
+    forged["run"]["measurement"] = json!("../jobs");
+    lab.write("forged.json", forged.to_string().as_bytes());
+    let refused = lab.refused(2, &["submit", "--manifest", "forged.json"]).await;
+    assert!(refused.contains("a damaged manifest"), "{refused}");
+
     // Another service has none of the inputs.
     let app = TestApp::with(&["--workers", "1"]).await;
     let far = Lab::new(format!("http://{}", app.address()), "");

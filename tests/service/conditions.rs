@@ -85,6 +85,25 @@ async fn a_body_must_match_its_headers() {
     app.send(digest(piece(), ABC)).await.expect(204);
 }
 
+/// A server may send plain content against the wish of the client, but must not refuse after the effect.
+#[tokio::test]
+async fn the_encoding_of_an_answer_is_never_a_reason_to_refuse() {
+    let app = TestApp::start().await;
+    for (at, encodings) in ["identity;q=0", "*;q=0", "br, *;q=0", ""].into_iter().enumerate() {
+        let post = app.request(Method::POST, "/v1/blobs").body(at.to_string());
+        let made = app.send(post.header("accept-encoding", encodings)).await.expect(201);
+        assert_eq!(made.header("content-encoding"), "", "{encodings}");
+    }
+    let page = |encodings: &str| {
+        app.request(Method::GET, "/openapi.yaml").header("accept-encoding", encodings)
+    };
+    let packed = app.send(page("gzip;q=0.5, identity;q=0")).await.expect(200);
+    assert_eq!(packed.header("content-encoding"), "gzip");
+    let tag = packed.header("etag").to_owned();
+    let known = app.send(page("gzip").header("if-none-match", tag)).await.expect(304);
+    assert!(known.header("vary").contains("accept-encoding"), "{}", known.header("vary"));
+}
+
 #[tokio::test]
 async fn a_busy_database_is_reported_as_temporary() {
     let app = TestApp::with(&["--workers", "0", "--request-seconds", "60"]).await;

@@ -36,6 +36,12 @@ async fn bad_masks_are_rejected_with_the_reason() {
             &["frame 2", "row 3", "column 5"],
         ),
         ("zero masks", constant(&[2, 8, 8], 0.0), "all_masks_zero", &["open"]),
+        (
+            "masks without light",
+            constant(&[2, 8, 8], 1e-30),
+            "all_masks_zero",
+            &["1e-30", "full_scale"],
+        ),
         ("one zero mask", npy(&[2, 8, 8], dark_frame.into_iter()), "mask_frame_zero", &["frame 1"]),
         ("values above 1", constant(&[2, 8, 8], 200.0), "above_full_scale", &["200", "full_scale"]),
         (

@@ -92,13 +92,17 @@ pub enum FormatError {
     )]
     BipolarMasks { percent: f64, low: f32, high: f32 },
     /// All masks are closed everywhere.
-    #[error("masks: no value is above 0 in any of the {frames} frames; masks need open pixels")]
-    AllMasksZero { frames: usize },
+    #[error(
+        "masks: the largest value of all {frames} frames is {largest:?}, less than a millionth of the full scale \
+         {full_scale:?}; masks need open pixels: state as `full_scale` the stored value of an open pixel"
+    )]
+    AllMasksZero { frames: usize, largest: f32, full_scale: f32 },
     /// One mask is closed everywhere.
     #[error(
-        "masks: frame {frame} of {frames} (counted from 0) has no value above 0; every mask needs open pixels"
+        "masks: frame {frame} of {frames} (counted from 0) has no value above a millionth of the full scale \
+         {full_scale:?}; every mask needs open pixels"
     )]
-    MaskFrameZero { frame: usize, frames: usize },
+    MaskFrameZero { frame: usize, frames: usize, full_scale: f32 },
     /// A value can't be represented after the division by the full scale.
     #[error(
         "measurement: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}, which can't be \

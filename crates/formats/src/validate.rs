@@ -9,6 +9,10 @@ use crate::error::{Lightless, Result};
 /// Masks may exceed 1 by this much, due to rounding in their normalisation. Such values are set to 1.
 const TOLERANCE: f32 = 1e-6;
 
+/// A mask whose largest value is below this share of the full scale is closed: no camera resolves it. The squares of its
+/// values, on which the projection divides, would leave the range of 32-bit floats.
+const MIN_OPEN: f32 = 1e-6;
+
 /// Statistics of masks on `[0,1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaskStatistics {
@@ -45,7 +49,7 @@ pub fn check_masks(
     let mut open = Array2::from_elem((info.height, info.width), false);
     let (mut clipped_negative, mut sum, mut measured) = (0, 0.0, 0u64);
     let mut largest = Located { value: 0.0, frame: 0, row: 0, column: 0 };
-    let (mut zero_frames, mut signs) = (Vec::new(), Signs::default());
+    let (mut closed_frames, mut signs) = (Vec::new(), Signs::default());
     let mut frames = 0;
     while let Some(mut mask) = reader.next_frame()? {
         check_size(&info, frames, &mask)?;
@@ -75,8 +79,8 @@ pub fn check_masks(
                 }
             }
         }
-        if frame_max == 0.0 {
-            zero_frames.push(frames);
+        if frame_max < MIN_OPEN {
+            closed_frames.push(frames);
         }
         frames += 1;
         sink(mask.view())?;
@@ -93,9 +97,12 @@ pub fn check_masks(
             full_scale: scale,
         });
     }
-    match zero_frames.first() {
-        Some(_) if zero_frames.len() == frames => Err(FormatError::AllMasksZero { frames }),
-        Some(&frame) => Err(FormatError::MaskFrameZero { frame, frames }),
+    match closed_frames.first() {
+        Some(_) if closed_frames.len() == frames => {
+            let largest = largest.value;
+            Err(FormatError::AllMasksZero { frames, largest, full_scale: scale })
+        }
+        Some(&frame) => Err(FormatError::MaskFrameZero { frame, frames, full_scale: scale }),
         None => Ok(MaskStatistics {
             dead_pixels: open.iter().filter(|open| !**open).count() as u64,
             clipped_negative,

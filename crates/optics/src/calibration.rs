@@ -12,6 +12,9 @@ const NEGATIVE_SIGMAS: f32 = 4.0;
 /// The corresponding limit for captures without repeats, where the noise is unknown, as a share of the white.
 const NEGATIVE_WITHOUT_REPEATS: f32 = -0.02;
 
+/// Values of captures and differences of references are between these. Their squares fit into 32-bit floats.
+const RANGE: std::ops::RangeInclusive<f32> = 1e-15..=1e15;
+
 /// Accumulates the repeats of one capture.
 #[derive(Debug)]
 pub struct Repeats {
@@ -60,7 +63,7 @@ impl Repeats {
 
     /// Adds a capture \[H,W\].
     ///
-    /// Errors: [`OpticsError::Captures`] for another size, and for values that are not finite.
+    /// Errors: [`OpticsError::Captures`] for another size, and for values that are not finite or above 1e15.
     pub fn add(&mut self, capture: ArrayView2<'_, f32>) -> Result<()> {
         if capture.dim() != self.sum.dim() {
             let ((a, b), (c, d)) = (capture.dim(), self.sum.dim());
@@ -69,9 +72,12 @@ impl Repeats {
                  size"
             )));
         }
-        if let Some(((row, column), value)) = capture.indexed_iter().find(|(_, v)| !v.is_finite()) {
+        let is_usable = |value: &f32| value.abs() <= *RANGE.end();
+        if let Some(((row, column), value)) = capture.indexed_iter().find(|(_, v)| !is_usable(v)) {
+            let limit = RANGE.end();
             return Err(OpticsError::Captures(format!(
-                "{value} at row {row}, column {column} (counted from 0); every value must be finite"
+                "{value:?} at row {row}, column {column} (counted from 0); every value must be finite and at most \
+                 {limit:?}: send the counts of the camera"
             )));
         }
         let saturation = self.saturation.unwrap_or(f32::INFINITY);
@@ -165,7 +171,7 @@ impl Calibrator {
     /// Prepares the denominator of Eq. 7.
     ///
     /// Errors: [`OpticsError::Captures`] if the references differ in size, or if the white is nowhere brighter than the
-    /// black.
+    /// black, or by less than 1e-15 in the median.
     pub fn new(references: References) -> Result<Self> {
         let size = references.white.mean.dim();
         let dark = [Some(&references.black), references.black_with_mask.as_ref()];
@@ -182,7 +188,13 @@ impl Calibrator {
             ));
         }
         let middle = positive.len() / 2;
-        let floor = *positive.select_nth_unstable_by(middle, f32::total_cmp).1 * MIN_DENOMINATOR;
+        let median = *positive.select_nth_unstable_by(middle, f32::total_cmp).1;
+        if median < *RANGE.start() {
+            return Err(OpticsError::Captures(format!(
+                "white is brighter than black by only {median:?} in the median: send the counts of the camera"
+            )));
+        }
+        let floor = median * MIN_DENOMINATOR;
         let too_dark = positive.iter().filter(|value| **value < floor).count() as u64;
         denominator.mapv_inplace(|value| if value < floor { 0.0 } else { value });
         Ok(Self { references, denominator, not_positive, too_dark })
@@ -292,7 +304,10 @@ mod tests {
         }
         let error = repeats.add(array![[1.0]].view()).unwrap_err().to_string();
         assert!(error.contains("1x1") && error.contains("1x2"), "{error}");
-        assert!(repeats.add(array![[f32::NAN, 1.0]].view()).is_err());
+        for unusable in [f32::NAN, f32::INFINITY, -1e30] {
+            let error = repeats.add(array![[unusable, 1.0]].view()).unwrap_err().to_string();
+            assert!(error.contains("row 0, column 0"), "{error}");
+        }
         let average = repeats.average().unwrap();
         assert_eq!(average.mean, array![[3.0, 98.0]]);
         // Three values with variance 4: the variance of their mean is 4/3.
@@ -333,6 +348,12 @@ mod tests {
         assert!(
             Calibrator::new(interchanged).unwrap_err().to_string().contains("nowhere brighter")
         );
+        let faint = References {
+            white: average(array![[1e-40]]),
+            black: average(array![[0.0]]),
+            black_with_mask: None,
+        };
+        assert!(Calibrator::new(faint).unwrap_err().to_string().contains("by only"));
     }
 
     #[test]

@@ -164,6 +164,11 @@ impl Part {
         let unwritable = |error: std::io::Error| CliError::file("write", &path, &error);
         let folder = path.parent().unwrap_or(Path::new("."));
         fs::create_dir_all(folder).map_err(unwritable)?;
+        // A link that somebody has put there could name any file of the user.
+        if path.symlink_metadata().is_ok_and(|metadata| metadata.is_symlink()) {
+            let text = format!("{} is a symbolic link: delete it", path.display());
+            return Err(CliError::Input(text));
+        }
         let mut options = OpenOptions::new();
         let file = options.create(true).truncate(false).read(true).write(true).open(&path);
         // Two processes would append to the same file.

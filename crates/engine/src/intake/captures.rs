@@ -31,6 +31,9 @@ const PICTURE_SIDE: usize = 640;
 /// Share of averaging in the work. Writing and analysing the masks take a tenth each.
 const AVERAGING_SHARE: f64 = 0.8;
 
+/// Least brightness of the brightest mask pixel as a share of the white's. No camera resolves less.
+const MIN_SCALE: f32 = 1e-6;
+
 /// The captures of a calibration as paths.
 pub type CaptureFiles = Captures<PathBuf>;
 
@@ -202,7 +205,7 @@ fn average_masks(
         patterns.push(PatternFigures::new(&mask, capture.saturated, capture.drift));
     }
     writer.finish()?;
-    if scale <= 0.0 {
+    if scale < MIN_SCALE {
         return Err(IntakeError::content(
             "patterns",
             &"no pattern is brighter than the dark frames: check that the light was on and that the LCoS showed the \
@@ -301,7 +304,17 @@ fn report_on(
     let findings = findings.into_iter().map(Finding::from).collect();
     let captures = captured.map(|captured| (&captured.figures, captured.scale));
     let names = maps.iter().map(|(name, _)| name.clone()).collect();
-    Ok(Report { report: CalibrationReport::new(figures, captures, findings, names), maps })
+    let report = CalibrationReport::new(figures, captures, findings, names);
+    // JSON writes a number that is not finite as null, which no reader takes for a number.
+    serde_json::to_string(&report)
+        .and_then(|text| serde_json::from_str::<CalibrationReport>(&text))
+        .map_err(|error| {
+            let detail = format!(
+                "a figure of the report is not finite ({error}): check the scale of the files"
+            );
+            IntakeError::content("the masks", &detail)
+        })?;
+    Ok(Report { report, maps })
 }
 
 /// Computes the statistics of masks, normalised by `scale`, band by band.

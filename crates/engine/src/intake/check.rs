@@ -68,22 +68,39 @@ pub struct Passed {
 /// values outside the scale and masks without an open pixel, and for errors of `sink`. After an error the output of
 /// `sink` is invalid.
 pub fn masks(
-    mut opened: Opened,
+    opened: Opened,
     bad: Option<&Array2<bool>>,
-    mut sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
+    sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
 ) -> Result<MaskStatistics> {
     check_count(&opened)?;
-    let without_bad = |mask: ArrayView2<'_, f32>| match bad {
-        None => sink(mask),
-        Some(bad) => {
-            let value = |(&mask, &bad): (&f32, &bool)| if bad { f32::NAN } else { mask };
-            let values = mask.iter().zip(bad).map(value).collect();
-            let masked = Array2::from_shape_vec(mask.dim(), values);
-            sink(masked.map_err(|error| FormatError::Internal(error.to_string()))?.view())
+    let mut measured = WithoutBad { reader: opened.reader, bad };
+    check_masks(&mut measured, opened.full_scale, sink).map_err(IntakeError::format(opened.name))
+}
+
+/// A reader that replaces the pixels of a map [H,W] by NaN.
+struct WithoutBad<'a> {
+    reader: Box<dyn FrameReader + Send>,
+    bad: Option<&'a Array2<bool>>,
+}
+
+impl FrameReader for WithoutBad<'_> {
+    fn info(&self) -> &StackInfo {
+        self.reader.info()
+    }
+
+    fn next_frame(&mut self) -> Result<Option<Array2<f32>>, FormatError> {
+        let mut frame = self.reader.next_frame()?;
+        if let (Some(frame), Some(bad)) = (&mut frame, self.bad)
+            && frame.dim() == bad.dim()
+        {
+            frame.zip_mut_with(bad, |value, &bad| {
+                if bad {
+                    *value = f32::NAN;
+                }
+            });
         }
-    };
-    check_masks(&mut *opened.reader, opened.full_scale, without_bad)
-        .map_err(IntakeError::format(opened.name))
+        Ok(frame)
+    }
 }
 
 /// Checks the number of masks.

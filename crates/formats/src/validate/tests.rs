@@ -115,9 +115,18 @@ fn infinities_and_zero_masks_are_refused_and_nan_are_kept() {
     let error = masks(array![[[f32::NEG_INFINITY, 0.5]]], 1.0).unwrap_err();
     assert_names(&error.to_string(), &["-inf", "frame 0, row 0, column 0"]);
     let error = masks(array![[[0.0, -1.0]], [[0.0, 0.0]]], 1.0).unwrap_err();
-    assert!(matches!(error, FormatError::AllMasksZero { frames: 2 }), "{error}");
+    assert!(matches!(error, FormatError::AllMasksZero { frames: 2, .. }), "{error}");
     let error = masks(array![[[1.0]], [[0.0]], [[0.0]]], 1.0).unwrap_err();
-    assert!(matches!(error, FormatError::MaskFrameZero { frame: 1, frames: 3 }), "{error}");
+    assert!(matches!(error, FormatError::MaskFrameZero { frame: 1, frames: 3, .. }), "{error}");
+}
+
+#[test]
+fn masks_far_below_their_full_scale_are_closed() {
+    // Their squares are 0 in 32 bits, so that every frame would be 0.
+    let error = masks(array![[[1.0]], [[0.5]]], 1e30).unwrap_err();
+    assert_names(&error.to_string(), &["largest value", "1.0", "full scale 1e30", "`full_scale`"]);
+    let error = masks(array![[[1e-7]], [[0.5]]], 1.0).unwrap_err();
+    assert!(matches!(error, FormatError::MaskFrameZero { frame: 0, .. }), "{error}");
 }
 
 #[test]

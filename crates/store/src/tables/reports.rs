@@ -5,13 +5,22 @@ use sqlx::SqliteConnection;
 use crate::Store;
 use crate::columns::{Json, sql, sql_as};
 use crate::error::Result;
-use engine::job::{CalibrationId, CalibrationReport};
+use engine::job::{CalibrationId, CalibrationReport, TaskKind};
 
 impl Store {
     /// The report of a calibration; none if it is not made yet.
     pub async fn report(&self, id: CalibrationId) -> Result<Option<CalibrationReport>> {
         let report = sql_as!("SELECT report FROM calibration_reports WHERE calibration = ?", [id]);
         Ok(report.fetch_optional(&self.readers).await?.map(|Json(report)| report))
+    }
+
+    /// The reason why the report of a calibration is not made; none unless all attempts have failed.
+    pub async fn report_failure(&self, id: CalibrationId) -> Result<Option<String>> {
+        let failed = "SELECT coalesce(reason, 'no reason is known') FROM tasks
+            JOIN attempts ON task = id AND attempts.attempt = tasks.attempt
+            WHERE thing = ? AND kind = ? AND state = 'failed'";
+        let kind: &str = TaskKind::Calibration.into_str();
+        sql_as!(failed, [id, kind]).fetch_optional(&self.readers).await
     }
 
     /// A picture of a report, as PNG; none if there is none of this name.

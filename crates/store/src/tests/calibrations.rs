@@ -169,9 +169,11 @@ async fn a_calibration_is_retried_and_then_fails_with_its_last_reason() {
         let task = lab.claim().await.unwrap();
         assert_eq!(task.lease.attempt, attempt);
         assert_eq!(lab.error(id).await, None);
+        assert_eq!(lab.store.report_failure(id).await.unwrap(), None);
         lab.store.fail(&task.lease, &format!("no disk, {attempt}"), true).await.unwrap();
     }
     assert_eq!(lab.error(id).await.unwrap(), "no disk, 3");
+    assert_eq!(lab.store.report_failure(id).await.unwrap().unwrap(), "no disk, 3");
     let attempts: Vec<(String, String)> = sqlx::query_as(
         "SELECT outcome, reason FROM attempts WHERE outcome = 'failed' ORDER BY attempt",
     )
