@@ -1,13 +1,14 @@
 """Fit the quality model, which predicts the error of blocks and the PSNR of a snapshot without true frames.
 
     python assessment.py make --binary sci-recon-experiments --data DATA [--more FOLDER] --out FOLDER
-    python assessment.py fit --out FOLDER... [--write ../../crates/reconstruction/src/assessment.json]
+    python assessment.py fit --out FOLDER... [--write ../../models/quality/model.onnx]
 
 `make` simulates snapshots of 128x128 and, twice as many, of 256x256 pixels and has them reconstructed. The scenes are
 photographs below a moving camera, half of them with independently moving parts, and clips. Masks are of every kind,
 half of them blurred or with light through closed pixels; Cr is 6 to 24, noise 0 to 10. An interrupted run can be
 continued, and at any time its cases are a mixture of all kinds. `fit` fits small networks to all cases, and reports
-their error by cross-validation over scenes. The scenes of `eval_loop.py`, which judges the networks, are in no fit.
+their error by cross-validation over scenes. It writes the file after each model, so that an interrupted one can be
+continued with --model. The scenes of `eval_loop.py`, which judges the networks, are in no fit.
 """
 import argparse
 import copy
@@ -19,10 +20,13 @@ import subprocess
 
 import cv2
 import numpy as np
+import onnx
 import torch
+from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
 import eval_loop
+import export
 
 SIDES, LONGEST, BLOCK = (128, 256, 256), 24, 16      # BLOCK as in the program
 PATTERNS = eval_loop.FOLLOWING[0]
@@ -33,10 +37,10 @@ SIGMAS = 0, 0, 0, 2, 5, 10
 SPEEDS = 0, 0, 0, .3, 1, 2, 4, 7, 7, 7
 ALGORITHMS = 'gap-tv', 'pnp-tv-fastdvdnet'
 # Quality models: name -> (algorithm, whether temporal changes were shrunk by more than SHRUNK), as in the program.
-MODELS = {'gap-tv': ('gap-tv', False), 'pnp-tv-fastdvdnet': ('pnp-tv-fastdvdnet', False), 'pnp-tv-fastdvdnet, shrunk': ('pnp-tv-fastdvdnet', True)}
+MODELS = {'gap-tv': ('gap-tv', False), 'pnp-tv-fastdvdnet': ('pnp-tv-fastdvdnet', False), 'pnp-tv-fastdvdnet-shrunk': ('pnp-tv-fastdvdnet', True)}
 SHRUNK = 1.0
-# The next five lines repeat constants of crates/reconstruction/src/assessment.rs.
-FEATURES, CHANNELS = 26, 128    # features of a block, then channels of the encoder
+# The next five lines repeat constants of crates/reconstruction/src/assessment.rs and quality.rs.
+FEATURES, CHANNELS, SIGNS = 26, 128, 8  # features of a block, channels of the encoder, estimates from hold-out pixels
 MOTION_DB, MOTION_WIDTH_DB, MIN_SHARE = 3.0, .3, .1     # see `first_run_estimate`
 MAX_DEVIATION = 3.0             # largest scaled input
 CONTRAST, GRADIENT = 11, 12     # indices of the features of the masks
@@ -48,6 +52,9 @@ TOLERANCE = eval_loop.TOLERANCE   # dB; the weight of larger misses saturates in
 MIN_CASES = 5       # cases below BEST that an interval needs in each half
 BLOCKS_PER_STEP = 64  # blocks of a case in a training step, each in all frames
 WHOLE = slice(14, 17)  # features of the whole frame
+# The white level in dB is an input of the fit only: the stated full scale of a measurement must not change a relative
+# error, so the program uses its mean.
+WHITE, WHITE_SCALE, WHITE_INPUT = -5.5, 5., 4 * FEATURES
 JOINED = .6         # share of cases that are joined to a part of another case
 WHITE_TOLERANCE = 6.0  # dB between the white levels of two cases that may be joined
 
@@ -247,7 +254,7 @@ class Model:
             self.scale(cases)
         inputs, firsts, others = [self.inputs(case).half() for case in cases], [self.first_run_estimate(case) for case in cases], self.partners(cases)
         self.networks = []
-        for seed, known in enumerate(start['networks'] if start else [None] * a.networks):
+        for seed, known in enumerate(self.layers(start) if start else [None] * a.networks):
             torch.manual_seed(seed)
             network = self.network(inputs[0].shape[1], known)
             if known is None:
@@ -260,18 +267,30 @@ class Model:
         model = cls.__new__(cls)
         model.first = first
         model.scale_as(record)
-        count = len(record['networks'][0][0]['weights'])
-        model.networks = [cls.network(count, known).eval() for known in record['networks']]
+        model.networks = [cls.network(len(known[0][0]), known).eval() for known in cls.layers(record)]
         return model
 
+    @staticmethod
+    def layers(record):
+        """For each network its layers, as weights [input, neuron] and biases; the white level has the weight 0."""
+        layers = [[torch.tensor(record[f'layer{number}/{part}']) for part in ('weights', 'bias')] for number in (1, 2, 3)]
+        weights = layers[0][0]
+        layers[0][0] = torch.cat([weights[:, :WHITE_INPUT], torch.zeros(len(weights), 1, weights.shape[2]), weights[:, WHITE_INPUT:]], 1)
+        return [[(weights[index], bias[index, 0]) for weights, bias in layers] for index in range(len(weights))]
+
     def scale_as(self, record):
-        by = lambda name: tuple(torch.tensor(record[name][part]) for part in ('mean', 'scale'))
-        encoding = record['encoding'] and (torch.tensor(record['encoding']['mean']), torch.tensor(record['encoding']['components']).T)
-        self.features, self.signs, self.encoding = by('features'), by('signs'), encoding
+        by = lambda name: tuple(torch.tensor(record[f'{name}/{part}']) for part in ('mean', 'scale'))
+        self.features = by('features')
+        self.signs = self.with_white(by('signs'))
+        self.encoding = (torch.tensor(record['encoder/mean']), torch.tensor(record['encoder/components']).T) if 'encoder/mean' in record else None
+
+    @staticmethod
+    def with_white(scaling):
+        return tuple(torch.cat([torch.tensor([white]), values]) for white, values in zip((WHITE, WHITE_SCALE), scaling))
 
     def scale(self, cases):
         self.features = scaling(torch.cat([case.features for case in cases]), .05)
-        self.signs = scaling(torch.stack([case.signs for case in cases]), 1e-3)
+        self.signs = self.with_white(scaling(torch.stack([case.signs[1:] for case in cases]), 1e-3))
         self.encoding = self.principal(torch.cat([case.encoded[::37].float() for case in cases])) if cases[0].encoded.shape[1] else None
 
     @staticmethod
@@ -302,8 +321,8 @@ class Model:
         network = nn.Sequential(nn.Linear(count, 64), nn.SiLU(), nn.Dropout(.15), nn.Linear(64, 16), nn.SiLU(), nn.Linear(16, 1))
         with torch.no_grad():
             for layer, known in zip([layer for layer in network if isinstance(layer, nn.Linear)], known or []):
-                layer.weight.copy_(torch.tensor(known['weights']).T)
-                layer.bias.copy_(torch.tensor(known['bias']))
+                layer.weight.copy_(known[0].T)
+                layer.bias.copy_(known[1])
         return network
 
     def first_run_estimate(self, case):
@@ -392,12 +411,73 @@ class Model:
                 network[-1].bias -= by / 10
 
     def record(self):
-        numbers = lambda tensor: [float(f'{value:.6g}') for value in tensor.tolist()]
-        layers = lambda network: [{'weights': [numbers(of_input) for of_input in layer.weight.T], 'bias': numbers(layer.bias)} for layer in network if isinstance(layer, nn.Linear)]
-        by = lambda scaling: {'mean': numbers(scaling[0]), 'scale': numbers(scaling[1])}
-        encoding = self.encoding and {'encoder': encoder(), 'mean': numbers(self.encoding[0]),
-                                      'components': [numbers(of_channel) for of_channel in self.encoding[1].T]}
-        return {'features': by(self.features), 'signs': by(self.signs), 'encoding': encoding, 'networks': [layers(network) for network in self.networks]}
+        """The arrays that the program needs, by their names in the file."""
+        record = {f'{name}/{part}': values for name, scaling in (('features', self.features), ('signs', [values[1:] for values in self.signs]))
+                  for part, values in zip(('mean', 'scale'), scaling)}
+        if self.encoding:
+            record |= {'encoder/mean': self.encoding[0], 'encoder/components': self.encoding[1].T}
+        linear = zip(*([layer for layer in network if isinstance(layer, nn.Linear)] for network in self.networks))
+        for number, layers in enumerate(linear, 1):
+            record[f'layer{number}/weights'] = torch.stack([layer.weight.detach().T for layer in layers])
+            record[f'layer{number}/bias'] = torch.stack([layer.bias.detach()[None] for layer in layers])
+        record = {name: values.numpy() for name, values in record.items()}
+        record['layer1/weights'] = np.delete(record['layer1/weights'], WHITE_INPUT, 1)
+        return record
+
+
+# ---------------------------------------------------------------- the file
+def graph_of(g, model, record):
+    """Nodes from the inputs of the file to the decimal logarithms of the errors [frames, rows, columns], the output `model`.
+    NaN are unknown: then the crop is the whole picture, and other features are the means of the fit."""
+    known = {name: g.constant(values.astype(np.float32), f'{model}/{name}') for name, values in record.items()}
+    add, limits = g.add, [g.constant(np.float32(end)) for end in (-MAX_DEVIATION, MAX_DEVIATION)]
+    scaled = lambda values, by: add('Clip', add('Div', add('Sub', values, known[f'{by}/mean']), known[f'{by}/scale']), *limits)
+    last = lambda values: add('Transpose', values, perm=[0, 2, 3, 1])       # features or channels become the last axis
+    or_else = lambda values, found, other: add('Where', add('IsNaN', values), other, found)
+    own = scaled(last('features'), 'features')
+    pooled = add('AveragePool', add('Transpose', own, perm=[0, 3, 1, 2]), kernel_shape=[3, 3], pads=[1, 1, 1, 1], count_include_pad=0)
+    around = last(pooled)
+    always = add('Expand', add('ReduceMean', around, axes=[0]), add('Shape', around))
+    crop = or_else('crop', scaled('crop', 'features'), add('ReduceMean', own, axes=[0, 1, 2], keepdims=0))
+    signs = or_else('signs', scaled('signs', 'signs'), g.constant(np.float32(0)))
+    size = add('Slice', add('Shape', own), g.ints([0]), g.ints([3]))
+    shared = add('Concat', crop, signs, axis=0)
+    parts = [own, around, always, add('Expand', shared, add('Concat', size, add('Shape', shared), axis=0))]
+    if 'encoder/mean' in record:
+        encoded = last('encoded')
+        shifted = or_else(encoded, add('Sub', encoded, known['encoder/mean']), g.constant(np.float32(0)))
+        parts.append(add('Clip', add('MatMul', shifted, known['encoder/components']), *limits))
+    values = add('Reshape', add('Concat', *parts, axis=3), g.ints([-1, record['layer1/weights'].shape[1]]))
+    for number in (1, 2, 3):
+        values = add('Add', add('MatMul', values, known[f'layer{number}/weights']), known[f'layer{number}/bias'])
+        values = add('Mul', values, add('Sigmoid', values)) if number < 3 else values
+    g.nodes.append(helper.make_node('Reshape', [add('ReduceMean', values, axes=[0]), size], [model]))
+
+
+def write(path, models):
+    """Write models as one ONNX file. The program reads its constants, and the misses of each model in the metadata."""
+    g = export.Graph()
+    for model, (record, _) in models.items():
+        graph_of(g, model, record)
+    tensor = lambda name, *sides: helper.make_tensor_value_info(name, TensorProto.FLOAT, sides)
+    inputs = [tensor('features', 'frames', FEATURES, 'rows', 'columns'), tensor('encoded', 'frames', CHANNELS, 'rows', 'columns'),
+              tensor('crop', FEATURES), tensor('signs', SIGNS)]
+    graph = helper.make_graph(g.nodes, 'quality', inputs, [tensor(model, 'frames', 'rows', 'columns') for model in models], g.constants)
+    m = helper.make_model(graph, opset_imports=[helper.make_opsetid('', export.OPSET)], ir_version=8, producer_name='sci-recon training')
+    helper.set_model_props(m, {'encoder': encoder()} | {model: json.dumps(misses) for model, (_, misses) in models.items()})
+    onnx.checker.check_model(m, full_check=True)
+    onnx.save(m, path)
+
+
+def read(path):
+    """The record and the misses of each model of a file."""
+    file = onnx.load(path)
+    properties = {one.key: one.value for one in file.metadata_props}
+    if properties.pop('encoder') != encoder():
+        raise SystemExit(f'{path} was fitted to another encoder')
+    arrays = {one.name: numpy_helper.to_array(one) for one in file.graph.initializer}
+    part = lambda model: {name[len(model) + 1:]: values.copy() for name, values in arrays.items() if name.startswith(model + '/')}
+    return {model: (part(model), json.loads(misses)) for model, misses in properties.items()}
 
 
 def settle(true, predicted, half, unshifted, outside):
@@ -422,11 +502,9 @@ def fit(a):
     if not a.epochs and not a.start:
         raise SystemExit('--epochs 0 needs the models of a file: --start')
     if a.start:
-        with open(a.start) as f:
-            start = json.load(f)
+        start = {name: record for name, (record, _) in read(a.start).items()}
     if a.write and os.path.exists(a.write):
-        with open(a.write) as f:
-            models = json.load(f)
+        models = read(a.write)
     for name in [a.model] if a.model else MODELS:
         algorithm, shrunk = MODELS[name]
         paths, judged = [path for folder in a.out for path in sorted(glob.glob(f'{folder}/*/scene.json'))], eval_loop.judged()
@@ -436,7 +514,7 @@ def fit(a):
             raise SystemExit(f"{', '.join(a.out)} has no cases for the model of {name}")
         # Strongly shrunk cases are few, so their model can start from that of the other cases.
         known = start and start.get(name, start[algorithm])
-        others = models.get(algorithm) or (start and start[algorithm])
+        others = models[algorithm][0] if algorithm in models else start and start[algorithm]
         if shrunk and not others:
             raise SystemExit(f'{name} needs the model of {algorithm} first: fit that, or give a file that has it (--write, --start)')
         first = Model.read(others) if shrunk else None
@@ -479,11 +557,9 @@ def fit(a):
         model = made(cases)
         model.move(by)
         rounded = lambda values: [round(float(value), 2) for value in values]
-        models[name] = model.record() | {'interval': rounded(interval), 'unfamiliar': {'offset': rounded([by_unfamiliar - by])[0], 'interval': rounded(of_unfamiliar)}}
-    if a.write:
-        with open(a.write, 'w') as f:
-            json.dump(models, f)
-            f.write('\n')
+        models[name] = model.record(), {'interval': rounded(interval), 'unfamiliar': {'offset': rounded([by_unfamiliar - by])[0], 'interval': rounded(of_unfamiliar)}}
+        if a.write:
+            write(a.write, models)
 
 
 def main():

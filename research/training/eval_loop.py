@@ -324,8 +324,8 @@ def ways(program, a, frames, folder):
 # ---------------------------------------------------------------- rows
 def source_hash():
     """Hash of the code and the quality models that a row depends on."""
-    files = sorted(f for part in ('reconstruction/src/**/*.rs', 'reconstruction/src/*.json', 'optics/src/**/*.rs')
-                   for f in glob.glob(os.path.join(HERE, '../../crates', part), recursive=True))
+    files = sorted(f for part in ('crates/reconstruction/src/**/*.rs', 'models/quality/*.onnx', 'crates/optics/src/**/*.rs')
+                   for f in glob.glob(os.path.join(HERE, '../..', part), recursive=True))
     digest = hashlib.sha256()
     for f in files:
         with open(f, 'rb') as content:

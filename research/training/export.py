@@ -25,9 +25,9 @@ class Graph:
     def __init__(self):
         self.nodes, self.constants, self.count = [], [], 0
 
-    def constant(self, value):
-        name = f'c{len(self.constants)}'
-        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(value), name))
+    def constant(self, value, name=None):
+        name = name or f'c{len(self.constants)}'
+        self.constants.append(numpy_helper.from_array(np.asarray(value, order='C'), name))
         return name
 
     def add(self, op, *inputs, **attributes):

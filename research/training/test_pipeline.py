@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import torch
 
+import assessment
 import export
 import model
 import solver
@@ -137,6 +138,58 @@ def test_network_for_one_calibration():
         frames, = export.session(os.path.join(out, 'network.onnx')).run(None, {
             'measurement': np.ones((1, 1, 50, 50), np.float32), 'masks': np.load(masks)[None]})
         assert frames.shape == (1, 6, 50, 50) and np.isfinite(frames).all()
+
+
+def log_errors(path, name, *inputs):
+    """Output of a quality model, for `features`, `encoded`, `crop` and `signs`."""
+    names = 'features', 'encoded', 'crop', 'signs'
+    return export.session(path).run([name], {key: np.asarray(values, np.float32) for key, values in zip(names, inputs)})[0]
+
+
+def test_quality_model_predicts_what_the_program_does():
+    """The figures are those of a test of crates/reconstruction/src/quality.rs, with the same inputs."""
+    root = os.path.join(HERE, '../..')
+    sample = lambda level, swing, *shape: np.fromfunction(lambda k, n, i, j: level + swing * np.sin(n + 2 * k + 3 * i + 5 * j), shape)
+    known = [sample(-2, 2, 2, 26, 2, 3), sample(-1, 1, 2, 128, 2, 3), sample(-2, 2, 1, 26, 1, 1).ravel(), sample(-25, 8, 1, 8, 1, 1).ravel()]
+    unknown = known[:1] + [np.full_like(values, np.nan) for values in known[1:]]
+    with open(os.path.join(root, 'tests/data/quality.json'), encoding='utf8') as f:
+        expected = json.load(f)
+    assert list(expected) == list(assessment.MODELS)
+    for name, cases in expected.items():
+        for case, inputs in (('known', known), ('unknown', unknown)):
+            found = log_errors(os.path.join(root, 'models/quality/model.onnx'), name, *inputs)
+            assert found.shape == (2, 2, 3) and np.abs(found.ravel() - cases[case]).max() < 1e-4, (name, case, found)
+
+
+def make_case(folder, number, algorithm):
+    """A snapshot of 128x128 pixels with random features, as `assessment.py make` writes it."""
+    r, name = np.random.default_rng(number), f'c{number:04d}'
+    os.makedirs(f'{folder}/{name}/{algorithm}')
+    rows = r.normal(-2, 1, (assessment.FEATURES + assessment.CHANNELS, 4, 64))
+    rows[assessment.CONTRAST] = -.5 if number % 2 else -2.5     # half of the masks are unfamiliar
+    np.save(f'{folder}/{name}/{algorithm}/{name}.npy', np.concatenate([rows, 10 ** rows[:1]]).astype(np.float32))
+    about = {'psnr_db': 20 + r.random(), 'white': 1., 'setting': {'pattern': 'iid', 'noise_sigma': 0}, 'pilot': None,
+             'evidence': {'signs': list(-20 - r.random(assessment.SIGNS)), 'features': list(rows[:assessment.FEATURES].mean((1, 2)))}}
+    for path, content in ((f'{algorithm}/{name}.json', about), ('scene.json', name)):
+        with open(f'{folder}/{name}/{path}', 'w', encoding='utf8') as f:
+            json.dump(content, f)
+
+
+def test_quality_model_is_fitted_and_continued():
+    name = algorithm = 'pnp-tv-fastdvdnet'
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(32):
+            make_case(folder, number, algorithm)
+        path = os.path.join(folder, 'model.onnx')
+        fit = lambda *options: run('assessment.py', 'fit', '--out', folder, '--write', path, '--model', name, '--folds', 2, '--epochs', 1, *options)
+        fit('--networks', 2)
+        fit('--start', path)
+        record, misses = assessment.read(path)[name]
+        assert record['layer1/weights'].shape[0] == 2 and misses['interval'][0] < misses['interval'][1]
+        case, fitted = assessment.Case(f'{folder}/c0003', algorithm), assessment.Model.read(record)
+        shaped = lambda values: values.float().reshape(4, 8, 8, -1).permute(0, 3, 1, 2)
+        found = log_errors(path, name, shaped(case.features), shaped(case.encoded), case.piece, case.signs[1:])
+        assert np.abs(found.ravel() - fitted.errors(case).numpy()).max() < 1e-3
 
 
 if __name__ == '__main__':

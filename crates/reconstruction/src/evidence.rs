@@ -2,7 +2,7 @@
 
 use ndarray::{Array3, ArrayView3, Axis, s};
 
-use super::assessment::{Evidence, features};
+use super::assessment::{Evidence, block_features};
 use super::crop;
 use super::error::{ReconError, Result};
 use super::hold_out::HoldOut;
@@ -80,7 +80,7 @@ impl HeldOutMeasurement<'_> {
             .is_some_and(|stage| stage.prior.tv().is_some_and(|tv| tv.temporal_weight == 0.0));
         let order =
             if is_frame_by_frame { Order::of(first_stage, self.whole.masks()) } else { None };
-        let evidence = Evidence::new(signs, &features(self.whole, early, last));
+        let evidence = Evidence::new(signs, &block_features(self.whole, early, last));
         Some(Evidence { prediction, order, ..evidence })
     }
 }

@@ -32,6 +32,7 @@ pub mod preview;
 pub mod priors;
 pub mod progress;
 pub mod projection;
+pub mod quality;
 #[cfg(test)]
 #[path = "tests/reference.rs"]
 mod reference;

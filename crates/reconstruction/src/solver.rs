@@ -2,10 +2,10 @@
 
 use std::ops::ControlFlow;
 
-use ndarray::{Array3, Array4, ArrayView3};
+use ndarray::{Array3, ArrayView3};
 use strum::Display;
 
-use super::assessment::{self, Evidence};
+use super::assessment::{Evidence, Features};
 use super::error::{Result, check_shape, shape_text};
 use super::gap::{Solver, run_stage};
 use super::operator::SensingOperator;
@@ -42,8 +42,8 @@ pub struct Outcome {
     pub residual: f32,
     /// Why it ended.
     pub stop_reason: StopReason,
-    /// Features of the quality model \[features, S B, rows, columns\] (see [`assessment`]), if requested.
-    pub features: Option<Array4<f32>>,
+    /// Features of the quality model, for each piece of the run, if requested.
+    pub features: Vec<Features>,
     /// Hold-out evidence of the frames' error, if requested.
     pub evidence: Option<Evidence>,
 }
@@ -88,18 +88,16 @@ pub fn reconstruct_assessed(
     let mut outcome = run_stages(op, y, schedule, &mut *networks, observer, after)?;
     let early = early.as_ref().map(|early| early.view());
     let learned = schedule.needs_network();
-    let mut features = |frames| {
+    let mut features_of = |frames| {
         let encoder = if learned { networks.encoder()? } else { None };
-        assessment::encoded_features(op, early, frames, encoder)
+        Features::of(op, early, frames, encoder)
     };
-    let final_features = features(outcome.frames.view())?;
-    outcome.features = Some(match &weakly_shrunk {
-        None => final_features,
-        Some(weak) => {
-            let frames = (outcome.frames.view(), weak.view());
-            assessment::with_first_run(&final_features, &features(weak.view())?, frames)?
-        }
-    });
+    let mut features = features_of(outcome.frames.view())?;
+    if let Some(weak) = &weakly_shrunk {
+        let weak = weak.view();
+        features = features.with_first_run(features_of(weak)?, outcome.frames.view(), weak);
+    }
+    outcome.features.push(features);
     Ok(outcome)
 }
 
@@ -141,7 +139,7 @@ pub(crate) fn run_stages(
         denoiser_passes: counts.network,
         residual,
         stop_reason: if converged { StopReason::Converged } else { StopReason::MaxIterations },
-        features: None,
+        features: Vec::new(),
         evidence: None,
     })
 }
@@ -187,10 +185,9 @@ mod tests {
         Control, Observer, Progress, blend_moving_regions, motion_map, reconstruct,
         reconstruct_assessed,
     };
-    use crate::assessment::FEATURES;
     use crate::operator::SensingOperator;
     use crate::schedule::Schedule;
-    use ndarray::{Array3, ArrayView3, Axis, s};
+    use ndarray::{Array3, ArrayView3, s};
     use rand::{RngExt, SeedableRng};
 
     #[test]
@@ -218,10 +215,8 @@ mod tests {
             let mut watch = Steps(&mut steps);
             let outcome =
                 reconstruct_assessed(&op, y.view(), &schedule, &mut (), &mut watch).unwrap();
-            let features = outcome.features.map(|features| features.len_of(Axis(0)));
             let twice = schedule.stages.iter().any(|stage| stage.static_shrinkage().is_some());
-            let expected = if twice { 2 * FEATURES.len() + 1 } else { FEATURES.len() };
-            assert_eq!(features, Some(expected), "with those of the weakly shrunk run");
+            assert_eq!(outcome.features[0].first_run.is_some(), twice, "the weakly shrunk run");
             assert!(steps.windows(2).all(|pair| pair[0].0 < pair[1].0 && pair[0].1 >= pair[1].1));
             assert_eq!(
                 steps.last().map(|step| step.0 == step.1),

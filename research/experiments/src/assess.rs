@@ -8,9 +8,10 @@ use clap::Args;
 use engine::job::{Algorithm, Sequence};
 use engine::pipeline::PipelineError;
 use formats::{Channels, npy};
-use ndarray::{Array3, ArrayView2, Axis, s};
-use reconstruction::assessment::{BLOCK, FEATURES, Model, blocks};
+use ndarray::{Array3, ArrayView2};
+use reconstruction::assessment::{BLOCK, BlockFeatures, Features, blocks};
 use reconstruction::metrics;
+use reconstruction::quality::Model;
 use sci_recon::cli::{CliError, MaskArguments, NetworkArguments, algorithms};
 use serde_json::json;
 
@@ -70,44 +71,51 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         let tile = bench.first_tile(&measured, &key)?;
         let (found, truth) = (&tile.outcome.frames, measured.truth());
         let (rows, columns) = blocks(side, side);
-        let Some(seen_of_tile) = &tile.outcome.features else {
+        let Some(features) = tile.outcome.features.first() else {
             let name = arguments.algorithm.into_str();
             return Err(CliError::Input(format!(
                 "{name}: there is no quality model for its results"
             )));
         };
-        let count = seen_of_tile.len_of(Axis(0));
-        let features = seen_of_tile.to_shape((count, frames, rows * columns));
-        let features = features.map_err(|error| CliError::Failure(error.to_string()))?;
-        let mut seen = Array3::zeros((count + 1, frames, rows * columns));
-        seen.slice_mut(s![..count, .., ..]).assign(&features);
-        let psnr = metrics::psnr(found.view(), truth.view()).map_err(PipelineError::from)?;
-        for (k, (found, truth)) in found.outer_iter().zip(truth.outer_iter()).enumerate() {
-            let squares = (&found - &truth).mapv(|error| (error / tile.white).powi(2));
-            for (at, block) in squares.exact_chunks((BLOCK, BLOCK)).into_iter().enumerate() {
-                seen[[count, k, at]] = block.mean().unwrap_or(0.0);
-            }
+        let mut seen = rows_of(features);
+        if let Some(first_run) = &features.first_run {
+            seen.extend(rows_of(&first_run.features));
+            seen.push(first_run.distance.clone());
         }
+        let psnr = metrics::psnr(found.view(), truth.view()).map_err(PipelineError::from)?;
+        let mut errors = Array3::zeros((frames, rows, columns));
+        let pairs = found.outer_iter().zip(truth.outer_iter());
+        for (mut errors, (found, truth)) in errors.outer_iter_mut().zip(pairs) {
+            let squares = (&found - &truth).mapv(|error| (error / tile.white).powi(2));
+            let blocks = squares.exact_chunks((BLOCK, BLOCK));
+            errors.iter_mut().zip(blocks).for_each(|(error, block)| {
+                *error = block.mean().unwrap_or(0.0);
+            });
+        }
+        seen.push(errors);
         let array = out.join(format!("{}.npy", clip.name));
         let failed = |error: std::io::Error| CliError::file("write", &array, &error);
         let file = fs::File::create(&array).map_err(failed)?;
-        let mut writer = npy::writer(file, seen.dim(), Channels::Grey)?;
-        for plane in seen.axis_iter(Axis(0)) {
-            writer.write_frame(plane)?;
+        let shape = (seen.len(), frames, rows * columns);
+        let mut writer = npy::writer(file, shape, Channels::Grey)?;
+        for row in &seen {
+            let plane = row.to_shape((frames, rows * columns));
+            writer
+                .write_frame(plane.map_err(|error| CliError::Failure(error.to_string()))?.view())?;
         }
         writer.finish()?;
         let pilot = tile.pilot.as_ref().and_then(|pilot| pilot.evidence.as_ref());
         let evidence = tile.outcome.evidence.as_ref().or(pilot);
         let schedule = tile.pilot.as_ref().map(|pilot| pilot.decide(&key.schedule));
         let expected = Model::of(schedule.as_ref().unwrap_or(&key.schedule)).map(|model| {
-            let errors = model.log_errors(seen_of_tile, evidence);
+            let errors = model.log_errors(features, evidence);
             let psnr = |frame: ArrayView2<'_, f32>| {
                 -10.0 * frame.mapv(|error| 10f32.powf(error)).mean().unwrap_or(0.0).log10()
             };
             let mean = errors.outer_iter().map(psnr).sum::<f32>() / frames as f32;
             mean - 20.0 * tile.white.log10()
         });
-        let about = json!({"clip": clip.name, "setting": setting, "cr": frames, "features": FEATURES,
+        let about = json!({"clip": clip.name, "setting": setting, "cr": frames,
             "algorithm": arguments.algorithm, "psnr_db": psnr, "expected_psnr_db": expected,
             "white": tile.white, "evidence": evidence, "pilot": tile.pilot});
         let path = out.join(format!("{}.json", clip.name));
@@ -117,4 +125,14 @@ pub fn run(arguments: &Arguments) -> Result<(), CliError> {
         eprintln!("{}: {psnr:.2} dB, expected {expected}", clip.name);
     }
     Ok(())
+}
+
+/// Each feature of the blocks, and each of the encoder's channels, \[frames, rows, columns\].
+fn rows_of(features: &Features) -> Vec<Array3<f32>> {
+    let values = features.blocks.map(BlockFeatures::values);
+    let count = values.first().map_or(0, Vec::len);
+    let mut rows: Vec<_> = (0..count).map(|n| values.map(|values| values[n])).collect();
+    let encoded = features.encoded.iter().flat_map(|encoded| encoded.outer_iter());
+    rows.extend(encoded.map(|channel| channel.to_owned()));
+    rows
 }

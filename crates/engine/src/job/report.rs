@@ -90,49 +90,43 @@ impl Grade {
 /// True if a finding says that the scale of the masks, the dark, or the masks themselves may be wrong. The quality model
 /// knows only results with the right ones.
 pub fn withholds_quality(findings: &[Finding]) -> bool {
-    use FindingCode::{
-        BadCalibration, BinaryMeasurement, DriftedMasks, ExchangedMasks, ForeignMasks,
-        InvertedMasks, MaskScale, MaskValues, MisplacedMasks, MissingMask, MissingPattern, Mosaic,
-        Negative, NegativeOffset, NoDark, ResampledMasks, ShiftedMasks, TurnedMasks,
-        UnexplainedPixels, WrongDark,
-    };
-    const DOUBTS: [FindingCode; 20] = [
-        BadCalibration,
-        BinaryMeasurement,
-        DriftedMasks,
-        ExchangedMasks,
-        ForeignMasks,
-        InvertedMasks,
-        MaskScale,
-        MaskValues,
-        MisplacedMasks,
-        MissingMask,
-        MissingPattern,
-        Mosaic,
-        Negative,
-        NegativeOffset,
-        NoDark,
-        ResampledMasks,
-        ShiftedMasks,
-        TurnedMasks,
-        UnexplainedPixels,
-        WrongDark,
-    ];
-    // The quality model does not count pixels that were not measured.
-    let lacks_pixels = |finding: &Finding| {
-        finding.severity == Severity::Error
-            && (finding.is(FindingCode::Saturated) || finding.is(FindingCode::BadPixels))
-    };
-    findings
-        .iter()
-        .any(|finding| lacks_pixels(finding) || DOUBTS.iter().any(|code| finding.is(*code)))
+    use FindingCode as Code;
+    findings.iter().any(|finding| match finding.code.parse() {
+        Ok(
+            Code::BadCalibration
+            | Code::BinaryMeasurement
+            | Code::DriftedMasks
+            | Code::ExchangedMasks
+            | Code::ForeignMasks
+            | Code::InvertedMasks
+            | Code::MaskScale
+            | Code::MaskValues
+            | Code::MisplacedMasks
+            | Code::MissingMask
+            | Code::MissingPattern
+            | Code::Mosaic
+            | Code::Negative
+            | Code::NegativeOffset
+            | Code::NoDark
+            | Code::ResampledMasks
+            | Code::ShiftedMasks
+            | Code::TurnedMasks
+            | Code::UnexplainedPixels
+            | Code::WrongDark,
+        ) => true,
+        // The quality model does not count pixels that were not measured.
+        Ok(Code::Saturated | Code::BadPixels) => finding.severity == Severity::Error,
+        _ => false,
+    })
 }
 
 /// True if a finding questions the full scale of the measurement. The expected PSNR is relative to the white level, so it
 /// does not depend on that scale.
 fn questions_scale(findings: &[Finding]) -> bool {
     use FindingCode::{LeftAligned, Level, RightAligned};
-    findings.iter().any(|finding| [Level, LeftAligned, RightAligned].iter().any(|c| finding.is(*c)))
+    let is_scale =
+        |finding: &Finding| matches!(finding.code.parse(), Ok(LeftAligned | Level | RightAligned));
+    findings.iter().any(is_scale)
 }
 
 /// The report on a calibration.

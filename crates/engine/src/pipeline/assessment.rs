@@ -6,10 +6,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, withholds_quality};
 pub use reconstruction::assessment::{BLOCK, blocks};
-use reconstruction::assessment::{Evidence, Model, unfamiliar_masks};
+use reconstruction::assessment::{Evidence, unfamiliar_masks};
 use reconstruction::hold_out::Prediction;
 use reconstruction::motion::fastest;
 use reconstruction::order::Order;
+use reconstruction::quality::Model;
 use reconstruction::schedule::Schedule;
 use reconstruction::sequence::RunShare;
 use reconstruction::solver::Outcome;
@@ -51,31 +52,22 @@ impl TileAssessment {
         (schedule, evidence, white): (&Schedule, Option<&Evidence>, f32),
     ) -> Option<Self> {
         let model = Model::of(schedule)?;
-        let Some(features) = &outcome.features else {
-            let (frames, height, width) = outcome.frames.dim();
-            let size = blocks(height, width);
-            let levels = vec![DARK; frames * size.0 * size.1];
-            return Some(Self {
-                size,
-                levels,
-                motion: 0.0,
-                unfamiliar: false,
-                prediction: None,
-                order: None,
-            });
-        };
+        let (frames, height, width) = outcome.frames.dim();
+        let (rows, columns) = blocks(height, width);
         let evidence = outcome.evidence.as_ref().or(evidence);
-        let errors = model.log_errors(features, evidence);
-        let unfamiliar = unfamiliar_masks(features);
-        let offset = if unfamiliar { model.unfamiliar.offset } else { 0.0 };
+        let unfamiliar = outcome.features.iter().any(|piece| unfamiliar_masks(&piece.blocks));
+        let offset = if unfamiliar { model.misses.unfamiliar.offset } else { 0.0 };
         let level = |error: &f32| {
             ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, 254.0) as u8
         };
-        let (_, rows, columns) = errors.dim();
+        let mut levels = vec![DARK; frames * rows * columns];
+        for piece in &outcome.features {
+            let errors = model.log_errors(piece, evidence);
+            let levels = levels.iter_mut().skip(piece.first_frame * rows * columns);
+            levels.zip(&errors).for_each(|(place, error)| *place = level(error));
+        }
         // The estimate of frames that are mostly wrong is unbounded, and the server refuses impossible records.
-        let (_, height, width) = outcome.frames.dim();
         let motion = fastest(outcome.frames.view(), white).max(0.0).min((height + width) as f32);
-        let levels = errors.iter().map(level).collect();
         let prediction = evidence.and_then(|evidence| evidence.prediction);
         let order = evidence.and_then(|evidence| evidence.order);
         Some(Self { size: (rows, columns), levels, motion, unfamiliar, prediction, order })
@@ -177,7 +169,8 @@ pub fn expected(
     };
     let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
     let bound = |offset: f64| (psnr_db + offset).min(Assessment::MAX_PSNR_DB);
-    let interval = if unfamiliar { model.unfamiliar.interval } else { model.interval };
+    let misses = &model.misses;
+    let interval = if unfamiliar { misses.unfamiliar.interval } else { misses.interval };
     let [low, high] = interval.map(bound);
     let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
     let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);

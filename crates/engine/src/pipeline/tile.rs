@@ -2,16 +2,17 @@
 
 use std::ops::Range;
 
-use ndarray::{Array3, Array4, ArrayView3, Axis, s};
+use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::residual::residual;
 use reconstruction::ReconError;
-use reconstruction::assessment::Model;
+use reconstruction::assessment::Features;
 use reconstruction::error::{check_parameter, check_shape};
 use reconstruction::evidence;
 use reconstruction::learned::SnapshotNetwork;
 use reconstruction::operator::SensingOperator;
 use reconstruction::priors::Networks;
+use reconstruction::quality::Model;
 use reconstruction::schedule::Schedule;
 use reconstruction::solver::{self, Observer, Outcome, StopReason};
 use reconstruction::unmeasured::filled;
@@ -75,7 +76,7 @@ impl TileInput {
             denoiser_passes: 0,
             residual: 0.0,
             stop_reason: StopReason::Converged,
-            features: None,
+            features: Vec::new(),
             evidence: None,
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(combined) };
@@ -93,12 +94,9 @@ impl TileInput {
             }
             let range = s![piece.start * frames..piece.end * frames, .., ..];
             combined.frames.slice_mut(range).assign(&outcome.frames);
-            if let Some(part) = outcome.features {
-                let (features, _, rows, columns) = part.dim();
-                let zeros = || Array4::zeros((features, combined.frames.dim().0, rows, columns));
-                let range = s![.., piece.start * frames..piece.end * frames, .., ..];
-                combined.features.get_or_insert_with(zeros).slice_mut(range).assign(&part);
-            }
+            let first_frame = piece.start * frames;
+            let features = outcome.features.into_iter();
+            combined.features.extend(features.map(|part| Features { first_frame, ..part }));
             combined.iterations = combined.iterations.max(outcome.iterations);
             combined.tv_iterations = combined.tv_iterations.max(outcome.tv_iterations);
             combined.denoiser_passes = combined.denoiser_passes.max(outcome.denoiser_passes);
@@ -157,7 +155,7 @@ pub fn run_network(
 ) -> Result<Outcome, ReconError> {
     input.snapshot_by_snapshot().solve_pieces(|op, y, _| {
         Ok(Outcome {
-            features: None,
+            features: Vec::new(),
             evidence: None,
             // Networks know no missing pixels.
             frames: network.frames(filled(y.index_axis(Axis(0), 0)).view(), op.masks())?,
@@ -262,18 +260,25 @@ mod tests {
         let y = concatenate(Axis(0), &[y.view(), (0.5 * &y).view(), (0.8 * &y).view()]).unwrap();
         let solve = |y: Array3<f32>, pieces| {
             let input = TileInput { masks: masks.clone(), y, white: 0.9, pieces };
-            reconstruct_tile(input, &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap().frames
+            reconstruct_tile(input, &Schedule::gap_tv3d(), &mut (), &mut ()).unwrap()
         };
         let solved_alone = |snapshots: std::ops::Range<usize>| {
             let alone = y.slice(s![snapshots, .., ..]).to_owned();
             let whole = 0..alone.dim().0;
             solve(alone, vec![whole])
         };
+        let (first, second) = (solved_alone(0..2), solved_alone(2..3));
         let two_pieces = solve(y.clone(), vec![0..2, 2..3]);
-        assert_eq!(two_pieces, concatenate![Axis(0), solved_alone(0..2), solved_alone(2..3)]);
-        let last_piece = solve(y.clone(), vec![1..3]);
+        assert_eq!(two_pieces.frames, concatenate![Axis(0), first.frames, second.frames]);
+        let [one, other] = &two_pieces.features[..] else { panic!("a piece has features") };
+        assert_eq!((one.first_frame, other.first_frame), (0, 8));
+        assert_eq!(
+            (&one.blocks, &other.blocks),
+            (&first.features[0].blocks, &second.features[0].blocks)
+        );
+        let last_piece = solve(y.clone(), vec![1..3]).frames;
         assert!(last_piece.slice(s![..4, .., ..]).iter().all(|&value| value == 0.0));
-        assert_eq!(last_piece.slice(s![4.., .., ..]), solved_alone(1..3));
+        assert_eq!(last_piece.slice(s![4.., .., ..]), solved_alone(1..3).frames);
     }
 
     #[test]

@@ -22,7 +22,7 @@ use engine::pipeline::tile::TileInput;
 use engine::pipeline::verify::verify;
 use formats::planar::{self, Reader};
 use formats::{FormatError, Limits};
-use reconstruction::assessment::Model;
+use reconstruction::quality::Model;
 use reconstruction::schedule::MAX_ITERATIONS;
 use store::{Completion, RemoteTask, StagedBlob, Work};
 
