@@ -241,10 +241,47 @@ findings! {
         "check that the masks are in the order in which the LCoS shows the patterns during a measurement";
 }
 
+/// What a finding of a measurement or a result questions, so that the verdict is doubtful.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Doubt {
+    /// The masks, their scale or the dark. There is no expected PSNR.
+    Inputs,
+    /// The full scale of the measurement. The expected PSNR is relative to the white level, so it does not depend on it.
+    Scale,
+}
+
 impl FindingCode {
     /// The code as it appears in reports and in the API.
     pub fn as_str(self) -> &'static str {
         self.into()
+    }
+
+    /// What the finding questions whatever its severity.
+    pub fn doubt(self) -> Option<Doubt> {
+        match self {
+            Self::BadCalibration
+            | Self::BinaryMeasurement
+            | Self::DriftedMasks
+            | Self::ExchangedMasks
+            | Self::ForeignMasks
+            | Self::InvertedMasks
+            | Self::MaskScale
+            | Self::MaskValues
+            | Self::MisplacedMasks
+            | Self::MissingMask
+            | Self::MissingPattern
+            | Self::Mosaic
+            | Self::Negative
+            | Self::NegativeOffset
+            | Self::NoDark
+            | Self::ResampledMasks
+            | Self::ShiftedMasks
+            | Self::TurnedMasks
+            | Self::UnexplainedPixels
+            | Self::WrongDark => Some(Doubt::Inputs),
+            Self::LeftAligned | Self::Level | Self::RightAligned => Some(Doubt::Scale),
+            _ => None,
+        }
     }
 }
 
@@ -287,7 +324,7 @@ mod tests {
 
     use strum::VariantArray;
 
-    use super::FindingCode;
+    use super::{Doubt, FindingCode};
 
     /// The beginning of `docs/FINDINGS.md`.
     const HEADER: &str = "\
@@ -296,14 +333,16 @@ mod tests {
 
 # Findings
 
-[DATA.md](DATA.md#warnings) explains where findings appear. \"Checked\" names the object that has the finding.
+[DATA.md](DATA.md#warnings) explains where findings appear. \"Checked\" names the object that has the finding. An error makes
+the [verdict](DATA.md#expected-psnr) of a job bad. \"Doubt\" names what a warning questions, so that the verdict is doubtful:
+the full `scale` of the measurement, or other `inputs`. With doubtful inputs there is no expected PSNR.
 
 ";
 
     fn page() -> String {
         let mut page = HEADER.to_owned();
         page.push_str(
-            "| code | checked | severity | meaning | remedy |\n| --- | --- | --- | --- | --- |\n",
+            "| code | checked | severity | doubt | meaning | remedy |\n| --- | --- | --- | --- | --- | --- |\n",
         );
         for code in FindingCode::VARIANTS {
             let entry = code.entry();
@@ -313,9 +352,17 @@ mod tests {
             let severities: Vec<_> =
                 severities.into_iter().map(|severity| severity.to_string()).collect();
             let (subjects, severities) = (subjects.join(", "), severities.join(" or "));
+            let doubt = match code.doubt() {
+                Some(Doubt::Inputs) => "inputs",
+                Some(Doubt::Scale) => "scale",
+                None => "",
+            };
             let (title, remedy) = (entry.title, entry.remedy);
-            writeln!(page, "| `{code}` | {subjects} | {severities} | {title} | {remedy} |")
-                .unwrap();
+            writeln!(
+                page,
+                "| `{code}` | {subjects} | {severities} | {doubt} | {title} | {remedy} |"
+            )
+            .unwrap();
         }
         page
     }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use strum::{IntoStaticStr, VariantArray};
 
 use super::ids::JobId;
-use optics::{CaptureFigures, MaskFigures};
+use optics::{CaptureFigures, Doubt, MaskFigures};
 pub use optics::{FindingCode, Severity};
 
 /// A problem that a check has found. [`FindingCode`] is the registry of all codes.
@@ -73,8 +73,10 @@ impl Grade {
         if findings.iter().any(|finding| finding.severity == Severity::Error) {
             return Some(Self::Bad);
         }
-        let is_doubtful = withholds_quality(findings) || questions_scale(findings);
-        is_doubtful.then_some(Self::Doubtful)
+        let is_scale_questioned = findings.iter().any(|finding| {
+            finding.code.parse::<FindingCode>().is_ok_and(|code| code.doubt() == Some(Doubt::Scale))
+        });
+        (withholds_quality(findings) || is_scale_questioned).then_some(Self::Doubtful)
     }
 
     /// The grade that follows from the worst finding.
@@ -87,46 +89,15 @@ impl Grade {
     }
 }
 
-/// True if a finding says that the scale of the masks, the dark, or the masks themselves may be wrong. The quality model
-/// knows only results with the right ones.
+/// True if a finding questions the masks, their scale or the dark. The quality model knows only results with the right
+/// ones.
 pub fn withholds_quality(findings: &[Finding]) -> bool {
-    use FindingCode as Code;
     findings.iter().any(|finding| match finding.code.parse() {
-        Ok(
-            Code::BadCalibration
-            | Code::BinaryMeasurement
-            | Code::DriftedMasks
-            | Code::ExchangedMasks
-            | Code::ForeignMasks
-            | Code::InvertedMasks
-            | Code::MaskScale
-            | Code::MaskValues
-            | Code::MisplacedMasks
-            | Code::MissingMask
-            | Code::MissingPattern
-            | Code::Mosaic
-            | Code::Negative
-            | Code::NegativeOffset
-            | Code::NoDark
-            | Code::ResampledMasks
-            | Code::ShiftedMasks
-            | Code::TurnedMasks
-            | Code::UnexplainedPixels
-            | Code::WrongDark,
-        ) => true,
         // The quality model does not count pixels that were not measured.
-        Ok(Code::Saturated | Code::BadPixels) => finding.severity == Severity::Error,
-        _ => false,
+        Ok(FindingCode::Saturated | FindingCode::BadPixels) => finding.severity == Severity::Error,
+        Ok(code) => code.doubt() == Some(Doubt::Inputs),
+        Err(_) => false,
     })
-}
-
-/// True if a finding questions the full scale of the measurement. The expected PSNR is relative to the white level, so it
-/// does not depend on that scale.
-fn questions_scale(findings: &[Finding]) -> bool {
-    use FindingCode::{LeftAligned, Level, RightAligned};
-    let is_scale =
-        |finding: &Finding| matches!(finding.code.parse(), Ok(LeftAligned | Level | RightAligned));
-    findings.iter().any(is_scale)
 }
 
 /// The report on a calibration.
