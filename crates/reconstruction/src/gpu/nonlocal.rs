@@ -1,18 +1,24 @@
 //! The nonlocal prior's clip and groups in the memory of a GPU. The kernels are in `nonlocal.wgsl`.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use wgpu::{BindGroupDescriptor, BindGroupEntry, Buffer, BufferUsages, ComputePipeline};
 
-use super::adapter::Gpu;
+use super::adapter::{Gpu, Shortage};
 use super::resident::{GROUP, grid};
 use crate::error::Result;
+
+/// Frames, height and width of a clip.
+type Size = (usize, usize, usize);
 
 // These constants are repeated in `nonlocal.wgsl`.
 /// Number of patches of a group.
 const PATCHES: usize = 40;
+/// Height and width of a patch, in pixels.
+const SIDE: usize = 6;
 /// Number of pixels of a patch.
-const PIXELS: usize = 36;
+const PIXELS: usize = SIDE * SIDE;
 /// Stands for no window, and for no patch.
 pub(crate) const NONE: u32 = u32::MAX;
 
@@ -35,9 +41,13 @@ pub(crate) struct Levels {
 }
 
 /// Clip and groups of the nonlocal prior on a GPU.
+///
+/// Filtered patches take 230 bytes for each voxel. If the GPU has no room for all at once, rows are divided into bands. A
+/// band filters all groups with a patch in its rows, some of them once more than other bands. Each pixel adds the same
+/// patches in the same order, so the number of bands changes no bit.
 pub(crate) struct Clip {
     gpu: Arc<Gpu>,
-    size: (usize, usize, usize),
+    size: Size,
     frames: Buffer,
     noisy: Buffer,
     guide: Buffer,
@@ -45,9 +55,30 @@ pub(crate) struct Clip {
     coefficients: Buffer,
     settings: Buffer,
     window: (usize, usize),
+    groups: Buffer,
+    /// The filtered patches of a band.
+    patches: Buffer,
+    bands: Vec<Band>,
+    /// Number of bands for which the GPU had room.
+    band_count: usize,
+}
+
+/// Rows of all frames that are filtered and aggregated together.
+struct Band {
+    rows: Range<usize>,
+    /// Number of groups with a patch in these rows.
     count: usize,
-    /// Patches of the groups, the filtered patches, and the patches at each place.
-    groups: [Buffer; 3],
+    /// Indices of these groups.
+    members: Buffer,
+    /// The patches at each place.
+    entries: Buffer,
+}
+
+/// The contents of a [`Band`].
+struct BandPlan {
+    rows: Range<usize>,
+    members: Vec<u32>,
+    entries: Vec<u32>,
 }
 
 impl Clip {
@@ -55,14 +86,13 @@ impl Clip {
     ///
     /// # Errors
     /// The GPU is too small or lost.
-    pub(crate) fn new(gpu: Arc<Gpu>, size: (usize, usize, usize), cosines: &[f32]) -> Result<Self> {
+    pub(crate) fn new(gpu: Arc<Gpu>, size: Size, cosines: &[f32]) -> Result<Self> {
         let voxels = size.0 * size.1 * size.2;
         let [frames, noisy, guide, coefficients, table] =
             gpu.buffers([voxels, voxels, voxels, voxels, cosines.len()])?;
         gpu.queue.write_buffer(&table, 0, bytemuck::cast_slice(cosines));
-        let settings = gpu.buffer(36, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
-        let groups = gpu.buffers([0; 3])?;
-        let (window, count) = ((0, 0), 0);
+        let settings = gpu.buffer(44, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
+        let [groups, patches] = gpu.buffers([0; 2])?;
         let cosines = table;
         Ok(Self {
             gpu,
@@ -73,9 +103,11 @@ impl Clip {
             cosines,
             coefficients,
             settings,
-            window,
-            count,
+            window: (0, 0),
             groups,
+            patches,
+            bands: Vec::new(),
+            band_count: 1,
         })
     }
 
@@ -83,13 +115,15 @@ impl Clip {
         self.size.0 * self.size.1 * self.size.2
     }
 
-    fn set(&self, levels: Levels) {
+    /// Sets the numbers for the next kernels, which work on `count` groups and these rows.
+    fn set(&self, levels: Levels, count: usize, rows: &Range<usize>) {
         let (frames, height, width) = self.size;
-        let integers = [width, height, frames, self.window.0, self.window.1, self.count];
+        let integers = [width, height, frames, self.window.0, self.window.1, count];
         // An unlimited margin must stay a number.
         let reals = [levels.margin.min(1e30), levels.shrinkage * levels.shrinkage, levels.tau];
         let integers = integers.into_iter().map(|value| value as u32);
-        let words: Vec<u32> = integers.chain(reals.map(f32::to_bits)).collect();
+        let rows = [rows.start as u32, rows.end as u32];
+        let words: Vec<u32> = integers.chain(reals.map(f32::to_bits)).chain(rows).collect();
         self.gpu.queue.write_buffer(&self.settings, 0, bytemuck::cast_slice(&words));
     }
 
@@ -117,7 +151,7 @@ impl Clip {
 
     /// Copies frames to the GPU, clamps outliers and shrinks changes along time.
     pub(crate) fn load(&self, frames: &[f32], levels: Levels) {
-        self.set(levels);
+        self.set(levels, 0, &(0..self.size.1));
         self.gpu.queue.write_buffer(&self.frames, 0, bytemuck::cast_slice(frames));
         let kernels = &self.gpu.kernels;
         let buffers = [(1, &self.frames), (2, &self.noisy)];
@@ -153,19 +187,15 @@ impl Clip {
     /// # Errors
     /// The GPU is too small or lost.
     pub(crate) fn search(&mut self, windows: &Windows) -> Result<()> {
-        (self.window, self.count) = (windows.size, windows.places.len());
-        let patches = self.count * PATCHES;
-        let voxels = self.voxels();
-        let lengths = [patches, patches * PIXELS, voxels + patches];
-        self.groups = self.gpu.buffers(lengths)?;
-        let [places] = self.gpu.buffers([8 * self.count])?;
+        let count = windows.places.len();
+        self.window = windows.size;
+        let [places, groups] = self.gpu.buffers([8 * count, count * PATCHES])?;
         self.gpu.queue.write_buffer(&places, 0, bytemuck::cast_slice(&windows.places));
-        self.set(Levels::default());
-        let [groups, _, entries] = &self.groups;
-        let buffers = [(3, &self.guide), (6, &places), (7, groups)];
-        self.run(&self.gpu.kernels.search, &buffers, self.count);
-        let mut found = vec![0.0f32; patches];
-        self.gpu.read(self.gpu.commands(), groups, &mut found)?;
+        self.set(Levels::default(), count, &(0..self.size.1));
+        let buffers = [(3, &self.guide), (6, &places), (7, &groups)];
+        self.run(&self.gpu.kernels.search, &buffers, count);
+        let mut found = vec![0.0f32; count * PATCHES];
+        self.gpu.read(self.gpu.commands(), &groups, &mut found)?;
         let mut found: Vec<u32> = found.into_iter().map(f32::to_bits).collect();
         for group in found.chunks_exact_mut(PATCHES) {
             // A clip too small for a full group repeats its patches.
@@ -174,10 +204,53 @@ impl Clip {
                 group.sort_unstable();
             }
         }
-        self.gpu.queue.write_buffer(groups, 0, bytemuck::cast_slice(&found));
-        let at_places = by_place(&found, voxels);
-        self.gpu.queue.write_buffer(entries, 0, bytemuck::cast_slice(&at_places));
+        self.gpu.queue.write_buffer(&groups, 0, bytemuck::cast_slice(&found));
+        self.groups = groups;
+        self.divide(&found)?;
         self.gpu.check()
+    }
+
+    /// Divides the rows into as many bands as the GPU needs for the patches of these groups.
+    ///
+    /// # Errors
+    /// It has no room for the patches of a single row.
+    pub(super) fn divide(&mut self, groups: &[u32]) -> Result<()> {
+        // The patches of the last search must not take the room of the new ones.
+        self.bands.clear();
+        [self.patches] = self.gpu.buffers([0])?;
+        loop {
+            let plans = plan(groups, self.size, self.band_count);
+            match self.hold(plans) {
+                Ok(()) => return Ok(()),
+                Err(_) if self.band_count < self.size.1 => {
+                    self.band_count = self.size.1.min(2 * self.band_count);
+                }
+                Err(shortage) => return Err(self.gpu.refusal(&shortage)),
+            }
+        }
+    }
+
+    /// Copies bands to the GPU, with room for the patches of the largest.
+    fn hold(&mut self, plans: Vec<BandPlan>) -> Result<(), Shortage> {
+        let most = plans.iter().map(|plan| plan.members.len()).max().unwrap_or_default();
+        let [patches] = self.gpu.allocate([most * PATCHES * PIXELS])?;
+        let mut bands = Vec::with_capacity(plans.len());
+        for BandPlan { rows, members, entries } in plans {
+            let [members_buffer, entries_buffer] =
+                self.gpu.allocate([members.len(), entries.len()])?;
+            self.gpu.queue.write_buffer(&members_buffer, 0, bytemuck::cast_slice(&members));
+            self.gpu.queue.write_buffer(&entries_buffer, 0, bytemuck::cast_slice(&entries));
+            let (count, members, entries) = (members.len(), members_buffer, entries_buffer);
+            bands.push(Band { rows, count, members, entries });
+        }
+        (self.patches, self.bands) = (patches, bands);
+        Ok(())
+    }
+
+    /// Number of bands of the last search.
+    #[cfg(test)]
+    pub(crate) fn band_count(&self) -> usize {
+        self.bands.len()
     }
 
     /// Filters the groups, and reads the frames that their patches give.
@@ -185,30 +258,61 @@ impl Clip {
     /// # Errors
     /// The GPU is lost.
     pub(crate) fn filter(&self, levels: Levels, frames: &mut [f32]) -> Result<()> {
-        self.set(levels);
-        let [groups, patches, entries] = &self.groups;
         let kernels = &self.gpu.kernels;
-        let buffers = [(2, &self.noisy), (7, groups), (8, patches)];
-        self.run(&kernels.low_rank, &buffers, self.count);
-        let buffers = [(1, &self.frames), (3, &self.guide), (8, patches), (9, entries)];
-        self.run(&kernels.aggregate, &buffers, self.voxels().div_ceil(GROUP));
+        let plane = self.size.0 * self.size.2;
+        for Band { rows, count, members, entries } in &self.bands {
+            self.set(levels, *count, rows);
+            let buffers = [(2, &self.noisy), (7, &self.groups), (8, &self.patches), (10, members)];
+            self.run(&kernels.low_rank, &buffers, *count);
+            let buffers = [(1, &self.frames), (3, &self.guide), (8, &self.patches), (9, entries)];
+            self.run(&kernels.aggregate, &buffers, (rows.len() * plane).div_ceil(GROUP));
+        }
         self.gpu.read(self.gpu.commands(), &self.frames, frames)
     }
 }
 
+/// Divides rows evenly into `count` bands, and finds the groups and patches of each.
+fn plan(groups: &[u32], (frames, height, width): Size, count: usize) -> Vec<BandPlan> {
+    let rows_of = |band: usize| height * band / count..height * (band + 1) / count;
+    let top_of = |place: u32| place as usize % (height * width) / width;
+    let band = |band: usize| {
+        let rows = rows_of(band);
+        let first_place_row = rows.start.saturating_sub(SIDE - 1);
+        let place_rows = rows.end - first_place_row;
+        let reaches = |place: u32| (first_place_row..rows.end).contains(&top_of(place));
+        let (mut members, mut patches) = (Vec::new(), Vec::new());
+        for (group, places) in groups.chunks_exact(PATCHES).enumerate() {
+            if places.iter().any(|&place| reaches(place)) {
+                members.push(group as u32);
+                patches.extend(places.iter().map(|&place| {
+                    let (frame, at) = (place as usize / width / height, place as usize % width);
+                    if !reaches(place) {
+                        return NONE;
+                    }
+                    let row = top_of(place) - first_place_row;
+                    ((frame * place_rows + row) * width + at) as u32
+                }));
+            }
+        }
+        let entries = by_place(&patches, frames * place_rows * width);
+        BandPlan { rows, members, entries }
+    };
+    (0..count).map(band).collect()
+}
+
 /// For each place the end of its entries; then the entries, which are indices of patches in the order of their places.
+/// Patches at [`NONE`] are left out.
 fn by_place(places: &[u32], count: usize) -> Vec<u32> {
-    let mut ends = vec![0u32; count + places.len()];
+    let is_inside = |place: &&u32| **place != NONE;
+    let mut ends = vec![0u32; count + places.iter().filter(is_inside).count()];
     let (ends_of, entries) = ends.split_at_mut(count);
-    for &place in places {
-        ends_of[place as usize] += 1;
-    }
+    places.iter().filter(is_inside).for_each(|&place| ends_of[place as usize] += 1);
     let mut sum = 0;
     for end in ends_of.iter_mut() {
         (sum, *end) = (sum + *end, sum);
     }
     // Each start moves to the end of its entries.
-    for (index, &place) in places.iter().enumerate() {
+    for (index, &place) in places.iter().enumerate().filter(|(_, place)| is_inside(place)) {
         let next = &mut ends_of[place as usize];
         entries[*next as usize] = index as u32;
         *next += 1;

@@ -1,5 +1,6 @@
 //! The kernels against the readable reference, on any Vulkan device, for example SwiftShader.
 
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::{Arc, OnceLock};
 
@@ -7,9 +8,10 @@ use ndarray::{Array3, s};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use serde_json::json;
-use wgpu::Limits;
+use wgpu::MemoryHints;
 
 use super::adapter::Gpu;
+use super::nonlocal::Clip;
 use super::speed;
 use crate::error::{ReconError, Result};
 use crate::operator::SensingOperator;
@@ -51,6 +53,14 @@ pub(crate) fn gpu() -> Option<Arc<Gpu>> {
         Err(error) => panic!("{error}"),
     };
     GPU.get_or_init(open).clone()
+}
+
+/// The GPU with buffers of at most so many bytes.
+pub(crate) fn small_gpu(bytes: u64) -> Arc<Gpu> {
+    let gpu = Gpu::open_with(|request| {
+        request.required_limits.max_storage_buffer_binding_size = bytes;
+    });
+    Arc::new(gpu.unwrap())
 }
 
 fn relative_difference(frames: &Array3<f32>, reference: &[f64]) -> f64 {
@@ -164,12 +174,12 @@ fn a_small_device_is_refused_in_words() {
     if gpu().is_none() {
         return;
     }
-    let small = |limits| Limits { max_storage_buffer_binding_size: 16 << 10, ..limits };
-    let gpu = Arc::new(Gpu::open_with(small).unwrap());
-    let error = solve(&Schedule::gap_tv(), &mut On(gpu)).unwrap_err().to_string();
+    let error = solve(&Schedule::gap_tv(), &mut On(small_gpu(16 << 10))).unwrap_err().to_string();
     assert!(error.contains("16384 bytes") && error.contains("smaller tiles"), "{error}");
-    let too_much = |limits| Limits { max_storage_buffers_per_shader_stage: u32::MAX, ..limits };
-    let error = Gpu::open_with(too_much).unwrap_err().to_string();
+    let opened = Gpu::open_with(|request| {
+        request.required_limits.max_storage_buffers_per_shader_stage = u32::MAX;
+    });
+    let error = opened.unwrap_err().to_string();
     assert!(error.contains("can't run"), "{error}");
 }
 
@@ -212,4 +222,71 @@ fn every_kernel_is_measured() {
     let kernels = ["loop", "projection", "total variation along time", "total variation", "sums"];
     assert_eq!(names, kernels);
     assert!(speeds.iter().all(|speed| speed.mvoxel_per_s > 0.0), "{speeds:?}");
+}
+
+/// Environment of a process with a driver that fails on request (`tests/service/shim/faulty_gpu.c`).
+fn faulty_driver(folder: &Path) -> Vec<(&'static str, PathBuf)> {
+    let icd = std::env::var("VK_ICD_FILENAMES").expect("the manifest of the driver");
+    let manifest = std::fs::read(&icd).unwrap();
+    let mut manifest: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
+    let library = manifest["ICD"]["library_path"].as_str().unwrap();
+    let original = Path::new(&icd).with_file_name(library);
+    let (shim, own) = (folder.join("libfaulty_gpu.so"), folder.join("icd.json"));
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/service/shim/faulty_gpu.c");
+    let mut cc = Command::new("cc");
+    cc.args(["-shared", "-fPIC", "-O1", "-o"]).arg(&shim).args([source, "-ldl"]);
+    assert!(cc.status().unwrap().success());
+    manifest["ICD"]["library_path"] = json!(shim);
+    std::fs::write(&own, manifest.to_string()).unwrap();
+    vec![
+        ("VK_ICD_FILENAMES", own),
+        ("FAULTY_GPU_DRIVER", original),
+        ("FAULTY_GPU_MEMORY", folder.join("memory")),
+    ]
+}
+
+/// Runs in a process with the driver of [`faulty_driver`].
+#[test]
+#[ignore = "a_full_device_is_used_in_bands_or_refused_in_words runs it in another process"]
+fn on_a_device_with_limited_memory() {
+    let memory = std::env::var("FAULTY_GPU_MEMORY").unwrap();
+    let limit = |bytes: u64| std::fs::write(&memory, bytes.to_string()).unwrap();
+    let gpu = Gpu::open_with(|request| {
+        // Larger buffers are allocated alone.
+        let suballocated_device_memory_block_size = 4 << 20..4 << 20;
+        request.memory_hints = MemoryHints::Manual { suballocated_device_memory_block_size };
+    });
+    let gpu = Arc::new(gpu.unwrap());
+    // Each patch near its own place, in 4 groups for each row.
+    let size = (2, 600, 40);
+    let place = |index: usize| (index / 40 / 4 * 40 + index % 30) as u32;
+    let groups: Vec<u32> = (0..2 * 594 * 4 * 40).map(place).collect();
+    let mut clip = Clip::new(Arc::clone(&gpu), size, &[0.5; 2]).unwrap();
+    let bands = |clip: &mut Clip| clip.divide(&groups).map(|()| clip.band_count());
+    assert_eq!(bands(&mut clip).unwrap(), 1);
+    // The patches take 27 MB.
+    limit(16 << 20);
+    assert_eq!(bands(&mut clip).unwrap(), 2);
+    limit(6 << 20);
+    assert_eq!(bands(&mut clip).unwrap(), 8);
+    limit(1 << 10);
+    let masks = Array3::from_elem((4, 640, 640), 1.0);
+    let operator = SensingOperator::new(masks).unwrap();
+    let y = Array3::zeros((1, 640, 640));
+    let ended = reconstruct(&operator, y.view(), &Schedule::gap_tv(), &mut On(gpu), &mut ());
+    let error = ended.map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("too little free memory") && error.contains("smaller tiles"), "{error}");
+}
+
+#[test]
+fn a_full_device_is_used_in_bands_or_refused_in_words() {
+    if gpu().is_none() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command.args(["--exact", "gpu::tests::on_a_device_with_limited_memory", "--ignored"]);
+    let output = command.envs(faulty_driver(folder.path())).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success() && text.contains("1 passed"), "{text}");
 }
