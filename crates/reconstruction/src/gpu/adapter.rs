@@ -20,6 +20,9 @@ pub struct Gpu {
     pub(super) queue: Queue,
     pub(super) kernels: Kernels,
     fault: Arc<Mutex<Option<Fault>>>,
+    /// Number of bytes that were copied to the host.
+    #[cfg(test)]
+    pub(super) read_bytes: std::sync::atomic::AtomicU64,
 }
 
 /// The compiled kernels.
@@ -28,6 +31,7 @@ pub(super) struct Kernels {
     pub(super) variation_along_time: ComputePipeline,
     pub(super) variation: ComputePipeline,
     pub(super) finish: ComputePipeline,
+    pub(super) hold_out: ComputePipeline,
     pub(super) limit_outliers: ComputePipeline,
     pub(super) analyse: ComputePipeline,
     pub(super) shrink: ComputePipeline,
@@ -122,6 +126,7 @@ impl Gpu {
             variation_along_time: kernel("variation_along_time"),
             variation: kernel("variation"),
             finish: kernel("finish"),
+            hold_out: kernel("hold_out"),
             limit_outliers: nonlocal("limit_outliers"),
             analyse: nonlocal("analyse"),
             shrink: nonlocal("shrink"),
@@ -129,7 +134,15 @@ impl Gpu {
             low_rank: nonlocal("low_rank"),
             aggregate: nonlocal("aggregate"),
         };
-        let gpu = Self { name, device, queue, kernels, fault };
+        let gpu = Self {
+            name,
+            device,
+            queue,
+            kernels,
+            fault,
+            #[cfg(test)]
+            read_bytes: Default::default(),
+        };
         gpu.check()?;
         Ok(gpu)
     }
@@ -224,6 +237,8 @@ impl Gpu {
         output: &mut [f32],
     ) -> Result<()> {
         let size = size_of_val(output) as u64;
+        #[cfg(test)]
+        self.read_bytes.fetch_add(size, std::sync::atomic::Ordering::Relaxed);
         let copy = self.buffer(size, BufferUsages::MAP_READ | BufferUsages::COPY_DST);
         commands.copy_buffer_to_buffer(buffer, 0, &copy, 0, size);
         self.queue.submit([commands.finish()]);
@@ -237,6 +252,17 @@ impl Gpu {
         let range = copy.get_mapped_range(..).map_err(|error| failed(&error))?;
         output.copy_from_slice(bytemuck::cast_slice(&range));
         Ok(())
+    }
+
+    /// Waits until all submitted commands are done.
+    ///
+    /// # Errors
+    /// As [`Gpu::check`].
+    pub(super) fn wait(&self) -> Result<()> {
+        let polled = self.device.poll(PollType::wait_indefinitely());
+        self.check()?;
+        let failed = |error| ReconError::Runtime(format!("the GPU {} failed: {error}", self.name));
+        polled.map(drop).map_err(failed)
     }
 
     pub(super) fn commands(&self) -> CommandEncoder {

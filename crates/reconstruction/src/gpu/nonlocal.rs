@@ -6,7 +6,7 @@ use std::sync::Arc;
 use wgpu::{BindGroupDescriptor, BindGroupEntry, Buffer, BufferUsages, ComputePipeline};
 
 use super::adapter::{Gpu, Shortage};
-use super::resident::{GROUP, grid};
+use super::resident::{DeviceFrames, GROUP, grid};
 use crate::error::Result;
 
 /// Frames, height and width of a clip.
@@ -48,13 +48,15 @@ pub(crate) struct Levels {
 pub(crate) struct Clip {
     gpu: Arc<Gpu>,
     size: Size,
-    frames: Buffer,
     noisy: Buffer,
     guide: Buffer,
     cosines: Buffer,
     coefficients: Buffer,
     settings: Buffer,
     window: (usize, usize),
+    group_count: usize,
+    /// The search windows of the groups.
+    places: Buffer,
     groups: Buffer,
     /// The filtered patches of a band.
     patches: Buffer,
@@ -88,22 +90,23 @@ impl Clip {
     /// The GPU is too small or lost.
     pub(crate) fn new(gpu: Arc<Gpu>, size: Size, cosines: &[f32]) -> Result<Self> {
         let voxels = size.0 * size.1 * size.2;
-        let [frames, noisy, guide, coefficients, table] =
-            gpu.buffers([voxels, voxels, voxels, voxels, cosines.len()])?;
+        let [noisy, guide, coefficients, table] =
+            gpu.buffers([voxels, voxels, voxels, cosines.len()])?;
         gpu.queue.write_buffer(&table, 0, bytemuck::cast_slice(cosines));
         let settings = gpu.buffer(44, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
-        let [groups, patches] = gpu.buffers([0; 2])?;
+        let [places, groups, patches] = gpu.buffers([0; 3])?;
         let cosines = table;
         Ok(Self {
             gpu,
             size,
-            frames,
             noisy,
             guide,
             cosines,
             coefficients,
             settings,
             window: (0, 0),
+            group_count: 0,
+            places,
             groups,
             patches,
             bands: Vec::new(),
@@ -149,16 +152,26 @@ impl Clip {
         self.gpu.queue.submit([commands.finish()]);
     }
 
-    /// Copies frames to the GPU, clamps outliers and shrinks changes along time.
-    pub(crate) fn load(&self, frames: &[f32], levels: Levels) {
+    /// Clamps the outliers of frames, and shrinks their changes along time.
+    pub(crate) fn load(&self, frames: &DeviceFrames, levels: Levels) {
+        self.limit_outliers(frames, levels);
+        if levels.shrinkage > 0.0 {
+            self.shrink(levels);
+        }
+    }
+
+    fn limit_outliers(&self, frames: &DeviceFrames, levels: Levels) {
         self.set(levels, 0, &(0..self.size.1));
-        self.gpu.queue.write_buffer(&self.frames, 0, bytemuck::cast_slice(frames));
-        let kernels = &self.gpu.kernels;
-        let buffers = [(1, &self.frames), (2, &self.noisy)];
-        self.run(&kernels.limit_outliers, &buffers, self.voxels().div_ceil(GROUP));
-        let changes = self.size.0 - 1;
-        if levels.shrinkage > 0.0 && changes > 0 {
-            let plane = self.size.1 * self.size.2;
+        let buffers = [(1, &frames.buffer), (2, &self.noisy)];
+        let kernel = &self.gpu.kernels.limit_outliers;
+        self.run(kernel, &buffers, self.voxels().div_ceil(GROUP));
+    }
+
+    fn shrink(&self, levels: Levels) {
+        let (changes, plane) = (self.size.0 - 1, self.size.1 * self.size.2);
+        if changes > 0 {
+            self.set(levels, 0, &(0..self.size.1));
+            let kernels = &self.gpu.kernels;
             let buffers = [(2, &self.noisy), (4, &self.cosines), (5, &self.coefficients)];
             self.run(&kernels.analyse, &buffers, (plane * changes).div_ceil(GROUP));
             self.run(&kernels.shrink, &buffers, plane.div_ceil(GROUP));
@@ -189,13 +202,12 @@ impl Clip {
     pub(crate) fn search(&mut self, windows: &Windows) -> Result<()> {
         let count = windows.places.len();
         self.window = windows.size;
-        let [places, groups] = self.gpu.buffers([8 * count, count * PATCHES])?;
-        self.gpu.queue.write_buffer(&places, 0, bytemuck::cast_slice(&windows.places));
-        self.set(Levels::default(), count, &(0..self.size.1));
-        let buffers = [(3, &self.guide), (6, &places), (7, &groups)];
-        self.run(&self.gpu.kernels.search, &buffers, count);
+        [self.places, self.groups] = self.gpu.buffers([8 * count, count * PATCHES])?;
+        self.group_count = count;
+        self.gpu.queue.write_buffer(&self.places, 0, bytemuck::cast_slice(&windows.places));
+        self.compare_patches();
         let mut found = vec![0.0f32; count * PATCHES];
-        self.gpu.read(self.gpu.commands(), &groups, &mut found)?;
+        self.gpu.read(self.gpu.commands(), &self.groups, &mut found)?;
         let mut found: Vec<u32> = found.into_iter().map(f32::to_bits).collect();
         for group in found.chunks_exact_mut(PATCHES) {
             // A clip too small for a full group repeats its patches.
@@ -204,10 +216,15 @@ impl Clip {
                 group.sort_unstable();
             }
         }
-        self.gpu.queue.write_buffer(&groups, 0, bytemuck::cast_slice(&found));
-        self.groups = groups;
+        self.gpu.queue.write_buffer(&self.groups, 0, bytemuck::cast_slice(&found));
         self.divide(&found)?;
         self.gpu.check()
+    }
+
+    fn compare_patches(&self) {
+        self.set(Levels::default(), self.group_count, &(0..self.size.1));
+        let buffers = [(3, &self.guide), (6, &self.places), (7, &self.groups)];
+        self.run(&self.gpu.kernels.search, &buffers, self.group_count);
     }
 
     /// Divides the rows into as many bands as the GPU needs for the patches of these groups.
@@ -253,21 +270,47 @@ impl Clip {
         self.bands.len()
     }
 
-    /// Filters the groups, and reads the frames that their patches give.
-    ///
-    /// # Errors
-    /// The GPU is lost.
-    pub(crate) fn filter(&self, levels: Levels, frames: &mut [f32]) -> Result<()> {
-        let kernels = &self.gpu.kernels;
-        let plane = self.size.0 * self.size.2;
-        for Band { rows, count, members, entries } in &self.bands {
-            self.set(levels, *count, rows);
-            let buffers = [(2, &self.noisy), (7, &self.groups), (8, &self.patches), (10, members)];
-            self.run(&kernels.low_rank, &buffers, *count);
-            let buffers = [(1, &self.frames), (3, &self.guide), (8, &self.patches), (9, entries)];
-            self.run(&kernels.aggregate, &buffers, (rows.len() * plane).div_ceil(GROUP));
+    /// Filters the groups, and computes the frames that their patches give.
+    pub(crate) fn filter(&self, levels: Levels, frames: &DeviceFrames) {
+        for band in &self.bands {
+            self.filter_groups(levels, band);
+            self.aggregate(band, frames);
         }
-        self.gpu.read(self.gpu.commands(), &self.frames, frames)
+    }
+
+    fn filter_groups(&self, levels: Levels, band: &Band) {
+        self.set(levels, band.count, &band.rows);
+        let members = (10, &band.members);
+        let buffers = [(2, &self.noisy), (7, &self.groups), (8, &self.patches), members];
+        self.run(&self.gpu.kernels.low_rank, &buffers, band.count);
+    }
+
+    /// Computes the rows of a band from the patches that were filtered last.
+    fn aggregate(&self, band: &Band, frames: &DeviceFrames) {
+        self.set(Levels::default(), band.count, &band.rows);
+        let entries = (9, &band.entries);
+        let buffers = [(1, &frames.buffer), (3, &self.guide), (8, &self.patches), entries];
+        let voxels = band.rows.len() * self.size.0 * self.size.2;
+        self.run(&self.gpu.kernels.aggregate, &buffers, voxels.div_ceil(GROUP));
+    }
+
+    /// The kernels by name, for measurements after a pass. Each works on the whole clip.
+    pub(crate) fn kernels<'a>(
+        &'a self,
+        levels: Levels,
+        frames: &'a DeviceFrames,
+    ) -> [(&'static str, Box<dyn Fn() + 'a>); 5] {
+        let each = move |run: &dyn Fn(&Band)| self.bands.iter().for_each(run);
+        [
+            ("nonlocal: outlier limits", Box::new(move || self.limit_outliers(frames, levels))),
+            ("nonlocal: temporal shrinkage", Box::new(move || self.shrink(levels))),
+            ("nonlocal: search", Box::new(move || self.compare_patches())),
+            (
+                "nonlocal: low-rank filter",
+                Box::new(move || each(&|band| self.filter_groups(levels, band))),
+            ),
+            ("nonlocal: aggregation", Box::new(move || each(&|band| self.aggregate(band, frames)))),
+        ]
     }
 }
 

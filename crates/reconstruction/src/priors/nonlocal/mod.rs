@@ -10,7 +10,7 @@
 mod layout;
 mod low_rank;
 #[cfg(feature = "gpu")]
-mod on_gpu;
+pub(crate) mod on_gpu;
 mod search;
 mod temporal_shrinkage;
 
@@ -133,7 +133,7 @@ impl Prior for NonlocalPrior {
 }
 
 /// Number of iterations for which groups are kept.
-const REFRESH: usize = 4;
+pub(crate) const REFRESH: usize = 4;
 /// `tau` in units of `PATCHES sigma^2`, the eigenvalue that noise alone would have.
 const STRENGTH: f32 = 4.0;
 /// Distance by which a pixel may exceed the range of its eight neighbours, in units of `sigma`. An isolated outlier spans

@@ -9,11 +9,13 @@ use super::{Nonlocal, REFRESH, STRENGTH, search};
 use crate::error::Result;
 use crate::gpu::adapter::Gpu;
 use crate::gpu::nonlocal::{Clip, Levels};
+use crate::gpu::resident::DeviceFrames;
 use crate::motion::Motion;
-use crate::priors::{Prior, Size};
+use crate::priors::Prior;
 
 /// The prior with its clip on a GPU, and the settings of the prior on the CPU.
-pub(super) struct OnGpu {
+pub(crate) struct OnGpu {
+    gpu: Arc<Gpu>,
     clip: Clip,
     settings: Nonlocal,
     shrinkage: f32,
@@ -24,27 +26,47 @@ impl OnGpu {
     ///
     /// # Errors
     /// The GPU is too small or lost.
-    pub(super) fn new(gpu: Arc<Gpu>, settings: Nonlocal, shrinkage: f32) -> Result<Self> {
+    pub(crate) fn new(gpu: Arc<Gpu>, settings: Nonlocal, shrinkage: f32) -> Result<Self> {
         let size = (settings.frames, settings.height, settings.width);
-        let clip = Clip::new(gpu, size, settings.temporal_shrinkage.cosines())?;
-        Ok(Self { clip, settings, shrinkage })
+        let clip = Clip::new(Arc::clone(&gpu), size, settings.temporal_shrinkage.cosines())?;
+        Ok(Self { gpu, clip, settings, shrinkage })
+    }
+
+    fn levels(&self, sigma: f32) -> Levels {
+        Levels {
+            margin: self.settings.outlier_limit * sigma,
+            shrinkage: self.shrinkage * sigma,
+            tau: STRENGTH * PATCHES as f32 * sigma * sigma,
+        }
+    }
+
+    /// The kernels by name, for measurements after a pass.
+    pub(crate) fn kernels<'a>(
+        &'a self,
+        frames: &'a DeviceFrames,
+        sigma: f32,
+    ) -> [(&'static str, Box<dyn Fn() + 'a>); 5] {
+        self.clip.kernels(self.levels(sigma), frames)
     }
 }
 
 impl Prior for OnGpu {
     fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
-        let Self { clip, settings, shrinkage } = self;
-        let size: Size = frames.dim();
+        let copy = DeviceFrames::zeros(Arc::clone(&self.gpu), frames.dim())?;
+        copy.write(frames);
+        self.denoise_on_gpu(&copy, sigma)?;
+        frames.assign(&copy.read()?);
+        Ok(())
+    }
+
+    fn denoise_on_gpu(&mut self, frames: &DeviceFrames, sigma: f32) -> Result<()> {
+        let levels = self.levels(sigma);
+        let Self { clip, settings, .. } = self;
+        let size = (settings.frames, settings.height, settings.width);
         if size.1 < SIDE || size.2 < SIDE {
             return Ok(());
         }
-        let levels = Levels {
-            margin: settings.outlier_limit * sigma,
-            shrinkage: *shrinkage * sigma,
-            tau: STRENGTH * PATCHES as f32 * sigma * sigma,
-        };
-        let mut values: Vec<f32> = frames.iter().copied().collect();
-        clip.load(&values, levels);
+        clip.load(frames, levels);
         if settings.passes == 0 {
             clip.guide_by_frames();
         }
@@ -59,8 +81,7 @@ impl Prior for OnGpu {
             clip.search(&search::windows(size, settings.passes / REFRESH, &motion))?;
         }
         settings.passes += 1;
-        clip.filter(levels, &mut values)?;
-        frames.iter_mut().zip(values).for_each(|(frame, value)| *frame = value);
+        clip.filter(levels, frames);
         Ok(())
     }
 }
