@@ -43,8 +43,8 @@ pub(crate) struct Levels {
 /// Clip and groups of the nonlocal prior on a GPU.
 ///
 /// Filtered patches take 230 bytes for each voxel. If the GPU has no room for all at once, rows are divided into bands. A
-/// band filters all groups with a patch in its rows, some of them once more than other bands. Each pixel adds the same
-/// patches in the same order, so the number of bands changes no bit.
+/// band filters all groups with a patch in its rows; groups at the edges of bands are filtered twice. Each pixel adds the
+/// same patches in the same order, so the number of bands changes no bit.
 pub(crate) struct Clip {
     gpu: Arc<Gpu>,
     size: Size,

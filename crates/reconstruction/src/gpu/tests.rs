@@ -466,12 +466,11 @@ fn every_kernel_is_measured() {
 }
 
 /// Environment of a process with a driver that fails on request (`tests/service/shim/faulty_gpu.c`).
-fn faulty_driver(folder: &Path) -> Vec<(&'static str, PathBuf)> {
-    let icd = std::env::var("VK_ICD_FILENAMES").expect("the manifest of the driver");
-    let manifest = std::fs::read(&icd).unwrap();
+fn faulty_driver(icd: &Path, folder: &Path) -> [(&'static str, PathBuf); 4] {
+    let manifest = std::fs::read(icd).unwrap();
     let mut manifest: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
     let library = manifest["ICD"]["library_path"].as_str().unwrap();
-    let original = Path::new(&icd).with_file_name(library);
+    let original = icd.with_file_name(library);
     let (shim, own) = (folder.join("libfaulty_gpu.so"), folder.join("icd.json"));
     let source = concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/service/shim/faulty_gpu.c");
     let mut cc = Command::new("cc");
@@ -479,17 +478,18 @@ fn faulty_driver(folder: &Path) -> Vec<(&'static str, PathBuf)> {
     assert!(cc.status().unwrap().success());
     manifest["ICD"]["library_path"] = json!(shim);
     std::fs::write(&own, manifest.to_string()).unwrap();
-    vec![
+    [
         ("VK_ICD_FILENAMES", own),
         ("FAULTY_GPU_DRIVER", original),
         ("FAULTY_GPU_MEMORY", folder.join("memory")),
+        ("FAULTY_GPU_LOSS", folder.join("loss")),
     ]
 }
 
 /// Runs in a process with the driver of [`faulty_driver`].
 #[test]
-#[ignore = "a_full_device_is_used_in_bands_or_refused_in_words runs it in another process"]
-fn on_a_device_with_limited_memory() {
+#[ignore = "a_full_device_is_used_in_bands_and_a_reset_is_reported runs it in another process"]
+fn on_a_faulty_device() {
     let memory = std::env::var("FAULTY_GPU_MEMORY").unwrap();
     let limit = |bytes: u64| std::fs::write(&memory, bytes.to_string()).unwrap();
     let gpu = Gpu::open_with(|request| {
@@ -514,20 +514,29 @@ fn on_a_device_with_limited_memory() {
     let masks = Array3::from_elem((4, 640, 640), 1.0);
     let operator = SensingOperator::new(masks).unwrap();
     let y = Array3::zeros((1, 640, 640));
-    let ended = reconstruct(&operator, y.view(), &Schedule::gap_tv(), &mut On(gpu), &mut ());
+    let mut on = On(gpu);
+    let ended = reconstruct(&operator, y.view(), &Schedule::gap_tv(), &mut on, &mut ());
     let error = ended.map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("too little free memory") && error.contains("smaller tiles"), "{error}");
+    std::fs::remove_file(&memory).unwrap();
+    solve(&Schedule::gap_tv().with_iterations(2), &mut on).unwrap();
+    std::fs::write(std::env::var("FAULTY_GPU_LOSS").unwrap(), "").unwrap();
+    for _ in 0..2 {
+        let ended = solve(&Schedule::gap_tv(), &mut on).map(|_| ());
+        assert!(matches!(ended, Err(ReconError::DeviceLost(_))), "{ended:?}");
+    }
 }
 
 #[test]
-fn a_full_device_is_used_in_bands_or_refused_in_words() {
-    if gpu().is_none() {
+fn a_full_device_is_used_in_bands_and_a_reset_is_reported() {
+    let Some(icd) = std::env::var_os("VK_ICD_FILENAMES").filter(|_| gpu().is_some()) else {
+        eprintln!("skipped: VK_ICD_FILENAMES names no driver");
         return;
-    }
+    };
     let folder = tempfile::tempdir().unwrap();
     let mut command = Command::new(std::env::current_exe().unwrap());
-    command.args(["--exact", "gpu::tests::on_a_device_with_limited_memory", "--ignored"]);
-    let output = command.envs(faulty_driver(folder.path())).output().unwrap();
+    command.args(["--exact", "gpu::tests::on_a_faulty_device", "--ignored"]);
+    let output = command.envs(faulty_driver(Path::new(&icd), folder.path())).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success() && text.contains("1 passed"), "{text}");
 }
