@@ -248,7 +248,8 @@ async fn a_worker_is_replaced_after_the_loss_of_its_device() {
 fn the_check_of_a_gpu_runs_all_steps() {
     let Some(library) = webgpu() else { return };
     let mut script = Command::new("scripts/gpu-check.sh");
-    script.args(["--short", "--program", env!("CARGO_BIN_EXE_sci-recon"), "--library", &library]);
+    script.args(["--short", "--seconds", "900", "--library", &library]);
+    script.args(["--program", env!("CARGO_BIN_EXE_sci-recon")]);
     let output = script.env("VK_ICD_FILENAMES", ICD).output().unwrap();
     let text = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stdout));
