@@ -15,7 +15,7 @@ use super::stage::Stage;
 
 /// The variables that one iteration hands to the next. They stay where they are from the first stage to the last.
 pub(crate) enum State {
-    Host(Iterate),
+    Host(Box<Iterate>),
     #[cfg(feature = "gpu")]
     Gpu(Box<Resident>),
 }
@@ -49,7 +49,7 @@ impl State {
         if let Some(gpu) = networks.gpu()? {
             return Ok(Self::Gpu(Box::new(Resident::new(gpu, problem, variables)?)));
         }
-        Ok(Self::Host(Iterate::zeros(problem.operator, variables)))
+        Ok(Self::Host(Box::new(Iterate::zeros(problem.operator, variables))))
     }
 
     /// Prepares the iterations of a stage.

@@ -294,24 +294,37 @@ impl Clip {
         self.run(&self.gpu.kernels.aggregate, &buffers, voxels.div_ceil(GROUP));
     }
 
-    /// The kernels by name, for measurements after a pass. Each works on the whole clip.
+    /// The kernels, for measurements after a pass. Each works on the whole clip.
     pub(crate) fn kernels<'a>(
         &'a self,
         levels: Levels,
         frames: &'a DeviceFrames,
-    ) -> [(&'static str, Box<dyn Fn() + 'a>); 5] {
+    ) -> [NamedKernel<'a>; 5] {
+        let kernel = |name, run: Box<dyn Fn() + 'a>| NamedKernel { name, run };
         let each = move |run: &dyn Fn(&Band)| self.bands.iter().for_each(run);
         [
-            ("nonlocal: outlier limits", Box::new(move || self.limit_outliers(frames, levels))),
-            ("nonlocal: temporal shrinkage", Box::new(move || self.shrink(levels))),
-            ("nonlocal: search", Box::new(move || self.compare_patches())),
-            (
+            kernel(
+                "nonlocal: outlier limits",
+                Box::new(move || self.limit_outliers(frames, levels)),
+            ),
+            kernel("nonlocal: temporal shrinkage", Box::new(move || self.shrink(levels))),
+            kernel("nonlocal: search", Box::new(move || self.compare_patches())),
+            kernel(
                 "nonlocal: low-rank filter",
                 Box::new(move || each(&|band| self.filter_groups(levels, band))),
             ),
-            ("nonlocal: aggregation", Box::new(move || each(&|band| self.aggregate(band, frames)))),
+            kernel(
+                "nonlocal: aggregation",
+                Box::new(move || each(&|band| self.aggregate(band, frames))),
+            ),
         ]
     }
+}
+
+/// A kernel that can be run again, for measurements.
+pub(crate) struct NamedKernel<'a> {
+    pub(crate) name: &'static str,
+    pub(crate) run: Box<dyn Fn() + 'a>,
 }
 
 /// Divides rows evenly into `count` bands, and finds the groups and patches of each.

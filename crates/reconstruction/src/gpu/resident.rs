@@ -527,6 +527,6 @@ fn dispatches(updates: usize) -> Vec<usize> {
 
 /// Workgroups in two dimensions, at least `count`.
 pub(super) fn grid(count: usize) -> [u32; 3] {
-    let columns = (count as u32).min(MAX_GROUPS).max(1);
+    let columns = (count as u32).clamp(1, MAX_GROUPS);
     [columns, (count as u32).div_ceil(columns), 1]
 }

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use ndarray::Array3;
 
 use super::adapter::Gpu;
+use super::nonlocal::NamedKernel;
 use super::resident::{DeviceFrames, Resident};
 use crate::error::Result;
 use crate::iterate::Variables;
@@ -89,7 +90,7 @@ fn nonlocal(gpu: &Arc<Gpu>, scene: &Array3<f32>) -> Result<Vec<Speed>> {
         gpu.wait()
     })?;
     let mut speeds = vec![speed("nonlocal prior", period / REFRESH as f64)];
-    for (name, run) in prior.kernels(&frames, sigma) {
+    for NamedKernel { name, run } in prior.kernels(&frames, sigma) {
         let seconds = mean_time(|| {
             run();
             gpu.wait()

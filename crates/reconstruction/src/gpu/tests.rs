@@ -385,7 +385,8 @@ impl Machine {
 
 impl Networks for Machine {
     fn network(&mut self, _: Network) -> Result<&mut dyn Denoiser> {
-        self.network.as_mut().map_or(Err(ReconError::NoDenoiser), |network| Ok(network))
+        let network = self.network.as_mut().ok_or(ReconError::NoDenoiser)?;
+        Ok(network)
     }
 
     fn gpu(&mut self) -> Result<Option<Arc<Gpu>>> {

@@ -8,7 +8,7 @@ use super::layout::{PATCHES, SIDE};
 use super::{Nonlocal, REFRESH, STRENGTH, search};
 use crate::error::Result;
 use crate::gpu::adapter::Gpu;
-use crate::gpu::nonlocal::{Clip, Levels};
+use crate::gpu::nonlocal::{Clip, Levels, NamedKernel};
 use crate::gpu::resident::DeviceFrames;
 use crate::motion::Motion;
 use crate::priors::Prior;
@@ -40,12 +40,12 @@ impl OnGpu {
         }
     }
 
-    /// The kernels by name, for measurements after a pass.
+    /// The kernels, for measurements after a pass.
     pub(crate) fn kernels<'a>(
         &'a self,
         frames: &'a DeviceFrames,
         sigma: f32,
-    ) -> [(&'static str, Box<dyn Fn() + 'a>); 5] {
+    ) -> [NamedKernel<'a>; 5] {
         self.clip.kernels(self.levels(sigma), frames)
     }
 }
