@@ -2,10 +2,11 @@
 # Check a GPU against the CPU and measure its speed. Needs bash and Python 3 without packages, and no network.
 #
 #   scripts/gpu-check.sh [--device gpu] [--sizes 256,512,1024] [--large 3200] [--program FILE] [--library FILE] [--seconds 480]
+#   scripts/gpu-check.sh --short      # every step with one scene of 16x16 pixels and few iterations, for software Vulkan
 #
-# Three small scenes are reconstructed on both devices, by total variation alone and with the same networks. Then the kernels of
-# the solver, its loop, networks and default jobs are timed at each size. A last job of
-# 3200x3200 runs if 150 s are left. The program must be built with --features gpu. Progress goes to standard error, one JSON object to standard output. Exit status: 0 if the results agree.
+# Three small scenes are reconstructed on both devices: by total variation alone, with the nonlocal prior, and with the same
+# network. Then the kernels of the solver, its loop, both priors, networks and default jobs are timed at each size. A last job
+# of 3200x3200 runs if 150 s are left. The program must be built with --features gpu. Progress goes to standard error, one JSON object to standard output. Exit status: 0 if the results agree.
 # In a folder that scripts/gpu-pack.sh packed, it uses the program, library and Vulkan loader of that folder.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -20,17 +21,25 @@ import argparse, array, json, math, os, random, struct, subprocess, sys, tempfil
 here = sys.argv[1]
 parser = argparse.ArgumentParser(prog='gpu-check.sh')
 parser.add_argument('--device', default='gpu')
-parser.add_argument('--sizes', default='256,512,1024')
+parser.add_argument('--sizes', help='sides in pixels [default: 256,512,1024]')
 packed = os.path.exists(here + '/sci-recon')
 parser.add_argument('--program', default=here + '/sci-recon' if packed else here + '/../target/release/sci-recon')
 parser.add_argument('--library', default=here + ('/libonnxruntime.so' if packed else '/../runtime-gpu/libonnxruntime.so'))
-parser.add_argument('--large', type=int, default=3200, help='side of the last job; 0 for none')
+parser.add_argument('--large', type=int, help='side of the last job; 0 for none [default: 3200]')
 parser.add_argument('--seconds', type=float, default=480)
+parser.add_argument('--short', action='store_true', help='try each step with one scene of 16x16 pixels and few iterations')
 options = parser.parse_args(sys.argv[2:])
 end = time.monotonic() + options.seconds
-FRAMES, SMALL, TOLERANCE = 8, 64, 1e-4
-# Seconds that must be left for the job of the last step.
-LARGE_SECONDS = 150
+TOLERANCE = 1e-4
+SCENES = ('disc',) if options.short else ('grating', 'disc', 'squares')
+# Frames, side of the scenes, iterations and network passes of the comparison, and seconds that must be left for the last job.
+FRAMES, SMALL, ITERATIONS, PASSES, LARGE_SECONDS = (3, 16, 4, 1, 0) if options.short else (8, 64, 40, 2, 150)
+# Numbers of network passes and of iterations whose times differ by those of the iterations between.
+PASS_COUNTS, ITERATION_COUNTS = ((1, 3), (10, 110)) if options.short else ((2, 10), (100, 1100))
+sizes = [int(size) for size in (options.sizes or ('16' if options.short else '256,512,1024')).split(',')]
+last_size = options.large if options.large is not None else 32 if options.short else 3200
+if any(size % SMALL or not size for size in [*sizes, last_size or SMALL]):
+    parser.error(f'--sizes and --large must be multiples of {SMALL}, the side of the scenes')
 report = {'device': options.device, 'scenes': {}, 'kernels': None, 'speed': {}, 'skipped': []}
 
 
@@ -67,6 +76,7 @@ def load(path):
 
 def scene(name, k, i, j):
     """Brightness of a pixel of frame k."""
+    i, j = i * 64 // SMALL, j * 64 // SMALL
     if name == 'grating':
         return .5 + .4 * math.sin((i + 2 * j) / 5 + k / 2)
     if name == 'disc':
@@ -105,6 +115,10 @@ def variation(iterations):
     return {'prior': 'tv', 'iterations': iterations, 'tv_weight': .15, 'temporal_weight': .004, 'tolerance': 0}
 
 
+def nonlocal_passes(passes):
+    return [variation(4), {'prior': 'nonlocal', 'iterations': passes, 'sigma': [.1, .05], 'tolerance': 0}]
+
+
 def stages(passes):
     return [variation(4), {'prior': 'fastdvdnet', 'iterations': passes, 'sigma': [.1, .05], 'tolerance': 0}]
 
@@ -120,7 +134,7 @@ def step(name, action):
 def compare(folder, name):
     inputs(folder, name, SMALL)
     largest = 0
-    for schedule in [variation(40)], stages(2):
+    for schedule in [variation(ITERATIONS)], nonlocal_passes(PASSES), stages(PASSES):
         frames = [load(reconstruct(folder, device, schedule)[1]) for device in ('cpu', options.device)]
         assert len(frames[0]) == len(frames[1])
         largest = max(largest, *(abs(a - b) for a, b in zip(*frames)))
@@ -135,15 +149,16 @@ def measure(folder, size):
         seconds = [reconstruct(folder, options.device, schedule(count))[0]['seconds'] for count in (few, many)]
         difference = seconds[1] - seconds[0]
         return round((many - few) * voxels / difference, 4) if difference > 0 else None
-    report['speed'][size] = {'network_mvoxel_per_s': speed(stages, 2, 10),
-                             'variation_mvoxel_per_s': speed(lambda count: [variation(count)], 100, 1100)}
+    report['speed'][size] = {'network_mvoxel_per_s': speed(stages, *PASS_COUNTS),
+                             'nonlocal_mvoxel_per_s': speed(nonlocal_passes, *PASS_COUNTS),
+                             'variation_mvoxel_per_s': speed(lambda count: [variation(count)], *ITERATION_COUNTS)}
     report['speed'][size] |= job(folder, size)
 
 
 def job(folder, size):
     """Speed of a default job."""
     voxels = FRAMES * size * size / 1e6
-    whole = reconstruct(folder, options.device)[0]
+    whole = reconstruct(folder, options.device, stages(PASSES) if options.short else None)[0]
     return {'job_seconds': whole['seconds'], 'job_cpu_seconds': whole['cpu_seconds'],
             'job_mvoxel_per_s': round(voxels / whole['seconds'], 4)}
 
@@ -159,18 +174,18 @@ def large(folder, size):
 with tempfile.TemporaryDirectory() as folder:
     try:
         report['devices'] = step('devices', lambda: program('devices', '--json', '--onnxruntime', options.library))
-        for name in ('grating', 'disc', 'squares'):
+        for name in SCENES:
             step(f'scene {name}', lambda: compare(f'{folder}/{name}', name))
         kernels = step('kernels', lambda: program('devices', '--json', '--onnxruntime', options.library,
-                                                  '--kernels', options.sizes))
+                                                  '--kernels', ','.join(map(str, sizes))))
         report['kernels'] = kernels and kernels['kernels']
-        for size in map(int, options.sizes.split(',')):
+        for size in sizes:
             step(f'size {size}', lambda: measure(f'{folder}/{size}', size))
-        if options.large:
-            step(f'size {options.large}', lambda: large(f'{folder}/{options.large}', options.large))
+        if last_size:
+            step(f'size {last_size}', lambda: large(f'{folder}/{last_size}', last_size))
     except RuntimeError as error:
         report['error'] = str(error)
-report['agrees'] = len(report['scenes']) == 3 and all(scene['agrees'] for scene in report['scenes'].values())
+report['agrees'] = len(report['scenes']) == len(SCENES) and all(scene['agrees'] for scene in report['scenes'].values())
 print(json.dumps(report))
 sys.exit(0 if report['agrees'] and 'error' not in report else 1)
 PY

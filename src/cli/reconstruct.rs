@@ -202,7 +202,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let cost = CostRecord {
         provider: uses_network.then(|| setup.network.provider(&setup.schedule).into()),
         onnxruntime: if records_version { Some(setup.network.version()?) } else { None },
-        gpu: setup.network.gpu_name(&setup.schedule),
+        gpu: setup.model.is_none().then(|| setup.network.gpu_name()).flatten(),
         cpu_seconds,
         peak_rss_bytes: peak_rss_bytes(),
     };

@@ -5,6 +5,10 @@ use std::process::{Command, Output};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+#[cfg(feature = "gpu")]
+use sqlx::ConnectOptions;
+#[cfg(feature = "gpu")]
+use sqlx::sqlite::SqliteConnectOptions;
 
 use crate::app::{TestApp, has_onnxruntime, skip};
 use crate::pipeline::{psnr, values};
@@ -148,4 +152,112 @@ async fn a_job_on_a_gpu_gives_the_frames_of_the_cpu() {
     assert!(decibels < 0.01, "{decibels} dB");
     eprintln!("largest difference between software Vulkan and the CPU: {largest:e}");
     assert!(largest <= TOLERANCE && expected.len() == computed.len(), "{largest}");
+}
+
+/// A driver with faults (`shim/faulty_gpu.c`).
+#[cfg(feature = "gpu")]
+struct FaultyDriver {
+    folder: tempfile::TempDir,
+    original: std::path::PathBuf,
+}
+
+#[cfg(feature = "gpu")]
+impl FaultyDriver {
+    fn build() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mut cc = Command::new("cc");
+        cc.args(["-shared", "-fPIC", "-O1", "-o"]).arg(folder.path().join("libfaulty_gpu.so"));
+        let status = cc.args(["tests/service/shim/faulty_gpu.c", "-ldl"]).status().unwrap();
+        assert!(status.success());
+        let manifest = |path: &Path| -> Value {
+            serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+        };
+        let mut own = manifest(Path::new(ICD));
+        let original = Path::new(ICD).with_file_name(own["ICD"]["library_path"].as_str().unwrap());
+        own["ICD"]["library_path"] = json!(folder.path().join("libfaulty_gpu.so"));
+        std::fs::write(folder.path().join("icd.json"), own.to_string()).unwrap();
+        Self { folder, original }
+    }
+
+    fn file(&self, name: &str) -> String {
+        self.folder.path().join(name).to_str().unwrap().to_owned()
+    }
+
+    async fn service(&self, arguments: &[&str]) -> TestApp {
+        let environment = [
+            ("VK_ICD_FILENAMES", self.file("icd.json")),
+            ("FAULTY_GPU_DRIVER", self.original.to_str().unwrap().to_owned()),
+            ("FAULTY_GPU_LOSS", self.file("loss")),
+        ];
+        let environment: Vec<_> =
+            environment.iter().map(|(name, value)| (*name, &**value)).collect();
+        TestApp::in_environment(arguments, &environment).await
+    }
+
+    /// Loses the device at its next work.
+    async fn lose(&self) {
+        std::fs::write(self.file("loss"), "").unwrap();
+        let start = Instant::now();
+        while Path::new(&self.file("loss")).exists() {
+            assert!(start.elapsed() < Duration::from_secs(60), "no work reaches the driver");
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    }
+}
+
+/// The task of a lost device is lost, not failed: another worker with another device does it at once.
+#[cfg(feature = "gpu")]
+#[tokio::test]
+async fn a_worker_is_replaced_after_the_loss_of_its_device() {
+    let Some(library) = webgpu() else { return };
+    let driver = FaultyDriver::build();
+    let options = ["--workers", "1", "--device", "gpu", "--onnxruntime", &library];
+    let app = driver.service(&options).await;
+    let scene = Scene { frames: 4, height: 48, width: 48, ..Scene::SMALL };
+    let (_, measurement) = app.scene(&scene).await;
+    let stage = json!({"prior": "tv", "iterations": 1500, "tv_weight": 0.1, "tolerance": 0});
+    let schedule = json!({"adaptive": false, "stages": [stage]});
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 0, "schedule": schedule});
+    let job = app.submit(&body).await;
+    let start = Instant::now();
+    loop {
+        let tiles =
+            app.get(&format!("/view/jobs/{job}/snapshots/0/tiles")).await.expect(200).json();
+        if tiles["items"][0]["iterations"].as_u64() > Some(0) {
+            break;
+        }
+        assert!(start.elapsed() < Duration::from_secs(60), "{tiles}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    driver.lose().await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    let figures = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
+    let exits = "sci_recon_worker_exits_total{reason=\"device_lost\"} 1";
+    assert!(figures.lines().any(|line| line == exits), "{figures}");
+    let options = SqliteConnectOptions::new().filename(app.data().join("sci-recon.db"));
+    let mut database = options.connect().await.unwrap();
+    let lost = "SELECT reason FROM attempts WHERE outcome = 'lost'";
+    let reasons: Vec<String> = sqlx::query_scalar(lost).fetch_all(&mut database).await.unwrap();
+    assert_eq!(reasons, ["the GPU of the worker was lost"]);
+}
+
+/// All steps of the script for machines with a card, with few iterations.
+#[cfg(feature = "gpu")]
+#[test]
+fn the_check_of_a_gpu_runs_all_steps() {
+    let Some(library) = webgpu() else { return };
+    let mut script = Command::new("scripts/gpu-check.sh");
+    script.args(["--short", "--seconds", "900", "--library", &library]);
+    script.args(["--program", env!("CARGO_BIN_EXE_sci-recon")]);
+    let output = script.env("VK_ICD_FILENAMES", ICD).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stdout));
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&report["agrees"], &report["skipped"]), (&json!(true), &json!([])), "{report:#}");
+    let kernels = report["kernels"]["mvoxel_per_s"]["16"].as_object().unwrap();
+    assert!(kernels.contains_key("loop") && kernels.contains_key("nonlocal prior"), "{report:#}");
+    for size in ["16", "32"] {
+        assert!(report["speed"][size]["job_seconds"].as_f64() > Some(0.0), "{report:#}");
+    }
 }

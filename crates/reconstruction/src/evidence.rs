@@ -38,8 +38,11 @@ pub fn collect(
     let hold_out = HoldOut::draw(whole, 0);
     let op = whole.clone().without(&hold_out.pixels);
     let mut early: Option<Array3<f32>> = None;
-    let solved = solver::run_stages(&op, y, schedule, networks, &mut (), |_, frames, _| {
-        early.get_or_insert_with(|| frames.clone());
+    let solved = solver::run_stages(&op, y, schedule, networks, &mut (), |_, state, _| {
+        if early.is_none() {
+            early = Some(state.frames()?.into_owned());
+        }
+        Ok(())
     });
     let outcome = match solved {
         // The solver of the whole picture reports divergence.

@@ -15,25 +15,22 @@
 
 use std::ops::ControlFlow;
 
-use ndarray::{Array3, ArrayView3, azip};
+use ndarray::{Array3, azip};
 
 use super::admm;
 use super::error::{ReconError, Result};
-#[cfg(feature = "gpu")]
-use super::gpu::resident::{Resident, Variation};
 use super::iterate::{Iterate, Variables};
 use super::operator::{SensingOperator, Statistics};
 use super::priors::{Networks, Prior};
-#[cfg(feature = "gpu")]
-use super::priors::{registry::PriorSpec, tv::TvSpec};
 use super::progress::{Control, Observer, Progress};
 use super::projection::{Problem, Projection, Settings, Step};
 use super::schedule::{Method, Schedule};
 use super::stage::{ProjectionSpec, Stage};
+use super::state::State;
 
 /// Runs a stage: up to `stage.iterations` times projection, prior and extrapolation.
 ///
-/// `after` sees the frames `v` after the last iteration, and after each one of a prior with a noise level; it may end the
+/// `after` sees the variables after the last iteration, and after each one of a prior with a noise level; it may end the
 /// stage. Returns true if the stage converged before its last iteration.
 ///
 /// # Errors
@@ -42,27 +39,26 @@ pub(crate) fn run_stage(
     solver: &mut Solver<'_>,
     (index, stage): (usize, &Stage),
     observer: &mut dyn Observer,
-    mut after: impl FnMut(ArrayView3<'_, f32>) -> ControlFlow<()>,
+    mut after: impl FnMut(&State) -> Result<ControlFlow<()>>,
 ) -> Result<bool> {
-    let Solver { problem, method, gamma, y_norm, iterate, networks, counts } = solver;
+    let Solver { problem, method, gamma, y_norm, state, networks, counts } = solver;
     let settings = settings(problem.operator, stage, *gamma);
-    let mut place = Place::choose(*problem, &settings, stage, &mut **networks, iterate)?;
+    let mut prior = stage.prior.start(problem.operator.dim(), &mut **networks)?;
+    state.start(*problem, &settings, stage)?;
     for iteration in 0..stage.iterations {
         let sigma = stage.sigma_at(iteration);
         let level = sigma.unwrap_or(0.0);
-        let (step, is_below) = match &mut place {
-            #[cfg(feature = "gpu")]
-            Place::Gpu(resident) => resident.step()?,
-            Place::Cpu(prior) => {
+        let (step, is_below) = match state {
+            State::Host(iterate) => {
                 let step = match method {
-                    Method::Gap => self::iterate(*problem, &settings, &mut **prior, level, iterate),
-                    Method::Admm => {
-                        admm::iterate(*problem, &settings, &mut **prior, level, iterate)
-                    }
+                    Method::Gap => self::iterate(*problem, &settings, &mut *prior, level, iterate),
+                    Method::Admm => admm::iterate(*problem, &settings, &mut *prior, level, iterate),
                 }?;
                 let is_below = step.change.relative() < stage.tolerance;
                 (step, is_below)
             }
+            #[cfg(feature = "gpu")]
+            State::Gpu(resident) => resident.iterate(&mut *prior, level)?,
         };
         let residual = (step.squared_residual.sqrt() / *y_norm) as f32;
         let change = step.change.relative();
@@ -80,50 +76,15 @@ pub(crate) fn run_stage(
         if observer.iteration(&progress) == Control::Cancel {
             return Err(ReconError::Cancelled);
         }
-        let is_last = converged || remaining == 0;
-        #[cfg(feature = "gpu")]
-        if let (Place::Gpu(resident), true) = (&place, is_last) {
-            resident.download(iterate)?;
-        }
-        let is_seen = is_last || sigma.is_some();
-        if is_seen && after(iterate.v.view()).is_break() || converged {
+        let is_seen = converged || remaining == 0 || sigma.is_some();
+        if is_seen && after(state)?.is_break() || converged {
             return Ok(converged);
         }
     }
     Ok(false)
 }
 
-/// The device that runs the iterations of a stage.
-enum Place<'a> {
-    Cpu(Box<dyn Prior + 'a>),
-    #[cfg(feature = "gpu")]
-    Gpu(Box<Resident>),
-}
-
-impl<'a> Place<'a> {
-    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
-    fn choose(
-        problem: Problem<'_>,
-        settings: &Settings,
-        stage: &Stage,
-        networks: &'a mut dyn Networks,
-        iterate: &Iterate,
-    ) -> Result<Self> {
-        #[cfg(feature = "gpu")]
-        if let PriorSpec::Tv(tv) = &stage.prior
-            && let Some(gpu) = networks.gpu()?
-        {
-            let &Stage { iterations, tolerance, .. } = stage;
-            let &TvSpec { tv_weight: weight, temporal_weight, tv_updates: updates } = tv;
-            let stage = Variation { weight, temporal_weight, updates, iterations, tolerance };
-            let resident = Resident::new(gpu, problem, settings, stage, iterate)?;
-            return Ok(Self::Gpu(Box::new(resident)));
-        }
-        Ok(Self::Cpu(stage.prior.start(problem.operator.dim(), networks)?))
-    }
-}
-
-/// One iteration, on the variables in `iterate`.
+/// One iteration, on the variables in `iterate`. On a GPU, the kernels of `gpu/resident.rs` do the same.
 fn iterate(
     problem: Problem<'_>,
     settings: &Settings,
@@ -157,7 +118,7 @@ pub(crate) struct Solver<'a> {
     /// Noise term of stages without one.
     gamma: f32,
     y_norm: f64,
-    pub(crate) iterate: Iterate,
+    pub(crate) state: State,
     pub(crate) networks: &'a mut dyn Networks,
     pub(crate) counts: Counts,
 }
@@ -186,11 +147,14 @@ impl Counts {
 
 impl<'a> Solver<'a> {
     /// A reconstruction that starts from 0.
+    ///
+    /// # Errors
+    /// The GPU is too small or lost.
     pub(crate) fn new(
         problem: Problem<'a>,
         schedule: &Schedule,
         networks: &'a mut dyn Networks,
-    ) -> Self {
+    ) -> Result<Self> {
         let squares: f64 = problem.y.iter().map(|&value| f64::from(value) * f64::from(value)).sum();
         let planned = schedule.planned_iterations();
         let variables = Variables {
@@ -198,28 +162,27 @@ impl<'a> Solver<'a> {
             w: schedule.extrapolates(),
             u: schedule.method == Method::Admm,
         };
-        Self {
+        Ok(Self {
             problem,
             method: schedule.method,
             gamma: schedule.gamma,
             y_norm: squares.sqrt().max(f64::MIN_POSITIVE),
-            iterate: Iterate::zeros(problem.operator, variables),
+            state: State::new(problem, variables, &mut *networks)?,
             networks,
             counts: Counts { done: 0, planned, total_variation: 0, network: 0 },
-        }
+        })
     }
 
-    /// The frames `v` \[S B,H,W\].
-    pub(crate) fn frames(&self) -> &Array3<f32> {
-        &self.iterate.v
-    }
-
-    /// `||y - H v|| / ||y||` of the frames.
-    pub(crate) fn residual(&mut self) -> f32 {
+    /// The frames `v` \[S B,H,W\] and their residual `||y - H v|| / ||y||`.
+    ///
+    /// # Errors
+    /// The GPU is lost.
+    pub(crate) fn finish(self) -> Result<(Array3<f32>, f32)> {
         let Problem { operator, y } = self.problem;
-        let Iterate { v, x, .. } = &mut self.iterate;
-        let squares = operator.project(0..y.dim().1, y, None, &Statistics::default(), v, x);
-        (squares.sqrt() / self.y_norm) as f32
+        let v = self.state.into_frames()?;
+        let mut x = Array3::zeros(v.dim());
+        let squares = operator.project(0..y.dim().1, y, None, &Statistics::default(), &v, &mut x);
+        Ok((v, (squares.sqrt() / self.y_norm) as f32))
     }
 }
 

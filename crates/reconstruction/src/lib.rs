@@ -43,6 +43,7 @@ pub mod sequence;
 pub mod signs;
 pub mod solver;
 pub mod stage;
+mod state;
 mod static_regions;
 pub mod tile;
 mod trial;

@@ -327,7 +327,7 @@ fn invert(gram: &Array2<f32>, snapshots: usize) -> Array3<f32> {
 }
 
 /// Statistics that a projection assumes of the frames' errors and of the noise, both in the same unit.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Statistics {
     /// Covariance `R` \[B,B\] of the frames' errors at a pixel of a snapshot; the identity if none.
     pub(crate) covariance: Option<Array2<f32>>,

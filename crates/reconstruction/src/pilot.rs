@@ -27,6 +27,7 @@ use super::progress::Observer;
 use super::projection::Problem;
 use super::schedule::{Heuristic, Schedule};
 use super::stage::Stage;
+use super::state::{Frames, State};
 use super::trial::{Trial, is_strong, temporal_shrinkage};
 use super::unmeasured::Measured;
 
@@ -135,14 +136,17 @@ pub fn decide(
     let (whole, y) = (&*whole, y_owned.view());
     let hold_out = HoldOut::draw(whole, 0);
     let op = whole.clone().without(&hold_out.pixels);
-    let mut solver = Solver::new(Problem { operator: &op, y: &y_owned }, schedule, networks);
-    let mut judge = Judge { op: &op, y, hold_out: &hold_out, observer };
+    let problem = Problem { operator: &op, y: &y_owned };
+    let mut solver = Solver::new(problem, schedule, networks)?;
+    let mut judge = Judge { problem, hold_out: &hold_out, observer };
     let mut trials: Vec<Trial> = Vec::with_capacity(schedule.stages.len());
     let (mut early, mut weakly_shrunk) = (None, None);
     for (index, planned) in schedule.stages.iter().enumerate() {
         let (trial, weak) = judge.choose(&mut solver, schedule, index, planned)?;
         weakly_shrunk = weak;
-        early.get_or_insert_with(|| solver.frames().clone());
+        if early.is_none() {
+            early = Some(solver.state.frames()?.into_owned());
+        }
         let diverged = trial.diverged;
         trials.push(trial);
         if diverged {
@@ -161,8 +165,7 @@ pub fn decide(
 
 /// Runs stages and measures their hold-out errors.
 struct Judge<'a> {
-    op: &'a SensingOperator,
-    y: ArrayView3<'a, f32>,
+    problem: Problem<'a>,
     hold_out: &'a HoldOut,
     observer: &'a mut dyn Observer,
 }
@@ -177,18 +180,18 @@ impl Judge<'_> {
         index: usize,
         planned: &Stage,
     ) -> Result<(Trial, Option<Array3<f32>>)> {
-        let start = solver.iterate.snapshot();
+        let start = solver.state.snapshot()?;
         let planned = planned.without_static_regions();
         let mut best = self.run(solver, index, &planned, None)?;
         let mut weakly_shrunk = None;
         for (heuristic, values) in GRID.iter().filter(|(heuristic, _)| schedule.has(*heuristic)) {
             for value in *values {
                 let Some(stage) = candidate(*heuristic, *value, &planned, &best) else { break };
-                let end = solver.iterate.snapshot();
-                solver.iterate.restore(start.snapshot());
+                let end = solver.state.snapshot()?;
+                solver.state.restore(start.copied()?);
                 let trial = self.run(solver, index, &stage, Some(&best))?;
                 if !trial.is_better_than(&best, schedule) {
-                    solver.iterate.restore(end);
+                    solver.state.restore(end);
                     break;
                 }
                 let is_static = best.is_static || trial.indicates_static_scene(&best, schedule);
@@ -211,16 +214,19 @@ impl Judge<'_> {
         rival: Option<&Trial>,
     ) -> Result<Trial> {
         let fixed = stage.prior.sigma().is_none();
-        let norm = self.hold_out.norm(self.y);
+        let norm = self.hold_out.norm(self.problem.y.view());
         let mut trial = Trial::new(stage.clone());
-        let measure = |frames: ArrayView3<'_, f32>| {
-            let squares = self.hold_out.residuals(self.op, self.y, frames);
+        let mut best = None;
+        let measure = |state: &State| {
+            let squares = state.hold_out_residuals(self.problem, self.hold_out)?;
             let done = trial.errors.len() + 1;
             let rivals = rival.filter(|_| !fixed).and_then(|rival| rival.squares.get(done - 1));
             let trails = rivals.is_some_and(|rivals| t_statistic(&squares, rivals) > ABANDON_T);
-            trial.add((squares.iter().sum::<f64>() / norm).sqrt(), squares, frames);
+            if trial.add((squares.iter().sum::<f64>() / norm).sqrt(), squares) {
+                best = Some(state.keep_frames()?);
+            }
             trial.abandoned = trails && 2 * done >= stage.iterations;
-            if trial.abandoned { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            Ok(if trial.abandoned { ControlFlow::Break(()) } else { ControlFlow::Continue(()) })
         };
         // A stage with a noise level is judged at its full length.
         let tolerance = if fixed { stage.tolerance } else { 0.0 };
@@ -229,9 +235,10 @@ impl Judge<'_> {
             Err(ReconError::Diverged { .. }) if !fixed => trial.diverged = true,
             other => {
                 other?;
-                trial.last_frames = Some(solver.frames().clone());
+                trial.last_frames = Some(solver.state.frames()?.into_owned());
             }
         }
+        trial.best_frames = best.map(Frames::into_host).transpose()?;
         Ok(trial)
     }
 }

@@ -14,6 +14,7 @@ pub use super::progress::{Control, Observer, Progress};
 use super::projection::Problem;
 use super::schedule::Schedule;
 use super::stage::Stage;
+use super::state::State;
 use super::static_regions::{blend_moving_regions, motion_map};
 use super::unmeasured::Measured;
 
@@ -64,7 +65,7 @@ pub fn reconstruct(
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
 ) -> Result<Outcome> {
-    run_stages(op, y, schedule, networks, observer, |_, _, _| ())
+    run_stages(op, y, schedule, networks, observer, |_, _, _| Ok(()))
 }
 
 /// As [`reconstruct`], with the features of the quality model; they include those of the encoder if a stage runs a network.
@@ -79,11 +80,12 @@ pub fn reconstruct_assessed(
     observer: &mut dyn Observer,
 ) -> Result<Outcome> {
     let (mut early, mut weakly_shrunk) = (None, None);
-    let after = |stage: usize, frames: &Array3<f32>, weak: Option<Array3<f32>>| {
+    let after = |stage: usize, state: &State, weak: Option<Array3<f32>>| {
         if stage == 0 && schedule.stages.len() > 1 {
-            early = Some(frames.clone());
+            early = Some(state.frames()?.into_owned());
         }
         weakly_shrunk = weak;
+        Ok(())
     };
     let mut outcome = run_stages(op, y, schedule, &mut *networks, observer, after)?;
     let early = early.as_ref().map(|early| early.view());
@@ -101,15 +103,15 @@ pub fn reconstruct_assessed(
     Ok(outcome)
 }
 
-/// Runs the stages. After each, `after` receives its index, the frames, and those of the weakly shrunk run if the stage was
-/// run twice.
+/// Runs the stages. After each, `after` receives its index, the variables, and the frames of the weakly shrunk run if the
+/// stage was run twice.
 pub(crate) fn run_stages(
     op: &SensingOperator,
     y: ArrayView3<'_, f32>,
     schedule: &Schedule,
     networks: &mut dyn Networks,
     observer: &mut dyn Observer,
-    mut after: impl FnMut(usize, &Array3<f32>, Option<Array3<f32>>),
+    mut after: impl FnMut(usize, &State, Option<Array3<f32>>) -> Result<()>,
 ) -> Result<Outcome> {
     schedule.validate()?;
     let (snapshots, height, width) = op.measurement_dim();
@@ -120,7 +122,7 @@ pub(crate) fn run_stages(
     schedule.networks().into_iter().try_for_each(|which| networks.network(which).map(|_| ()))?;
     let measured = Measured::new(op, y);
     let problem = Problem { operator: &measured.op, y: &measured.y };
-    let mut solver = Solver::new(problem, schedule, networks);
+    let mut solver = Solver::new(problem, schedule, networks)?;
     let mut converged = false;
     for (index, stage) in schedule.stages.iter().enumerate() {
         let weak;
@@ -128,12 +130,12 @@ pub(crate) fn run_stages(
             None => (run_once(&mut solver, index, stage, observer)?, None),
             Some(shrinkage) => run_twice(&mut solver, index, stage, shrinkage, observer)?,
         };
-        after(index, solver.frames(), weak);
+        after(index, &solver.state, weak)?;
     }
-    let residual = solver.residual();
     let counts = solver.counts;
+    let (frames, residual) = solver.finish()?;
     Ok(Outcome {
-        frames: solver.iterate.v,
+        frames,
         iterations: counts.done,
         tv_iterations: counts.total_variation,
         denoiser_passes: counts.network,
@@ -150,7 +152,7 @@ fn run_once(
     stage: &Stage,
     observer: &mut dyn Observer,
 ) -> Result<bool> {
-    run_stage(solver, (index, stage), observer, |_| ControlFlow::Continue(()))
+    run_stage(solver, (index, stage), observer, |_| Ok(ControlFlow::Continue(())))
 }
 
 /// Runs a stage with weak, and again with strong temporal shrinkage from the same start, and blends the weakly shrunk frames
@@ -168,13 +170,16 @@ fn run_twice(
     if let Some(nonlocal) = strong_stage.prior.nonlocal_mut() {
         nonlocal.temporal_shrinkage = strong_shrinkage;
     }
-    let start = solver.iterate.snapshot();
+    let start = solver.state.snapshot()?;
     run_once(solver, index, &weak_stage, observer)?;
-    let motion = blended.then(|| motion_map(&start.v, solver.frames()));
-    let weak = solver.iterate.restore(start);
+    let motion = match blended {
+        true => Some(motion_map(&*start.frames()?, &*solver.state.frames()?)),
+        false => None,
+    };
+    let weak = solver.state.restore(start).into_host()?;
     let converged = run_once(solver, index, &strong_stage, observer)?;
     if let Some(motion) = motion {
-        blend_moving_regions(&mut solver.iterate.v, &weak, &motion);
+        solver.state.edit_frames(|frames| blend_moving_regions(frames, &weak, &motion))?;
     }
     Ok((converged, Some(weak)))
 }

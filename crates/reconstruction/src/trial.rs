@@ -1,6 +1,6 @@
 //! A stage that was tried on a crop, and how it compares with others by its hold-out errors.
 
-use ndarray::{Array3, ArrayView3};
+use ndarray::Array3;
 
 use super::hold_out::t_statistic;
 use super::schedule::{Heuristic, Schedule};
@@ -61,12 +61,12 @@ impl Trial {
         }
     }
 
-    pub(crate) fn add(&mut self, error: f64, squares: Vec<f64>, frames: ArrayView3<'_, f32>) {
-        if error < self.smallest_error() {
-            self.best_frames = Some(frames.to_owned());
-        }
+    /// Adds the hold-out errors after an iteration. Returns true if no other one was as small.
+    pub(crate) fn add(&mut self, error: f64, squares: Vec<f64>) -> bool {
+        let is_smallest = error < self.smallest_error();
         self.errors.push(error);
         self.squares.push(squares);
+        is_smallest
     }
 
     fn smallest_error(&self) -> f64 {

@@ -300,7 +300,7 @@ fn tile(
             None => source.provider(&task.schedule).into(),
         }),
         onnxruntime: if uses_network { Some(source.version()?) } else { None },
-        gpu: source.gpu_name(&task.schedule),
+        gpu: task.model.is_none().then(|| source.gpu_name()).flatten(),
         cpu_seconds: cpu_seconds() - before + process_seconds,
         peak_rss_bytes: peak_rss_bytes() + process_peak,
     };

@@ -16,9 +16,7 @@ use reconstruction::priors::network::{ClipDenoiser, ClipEncoder};
 use reconstruction::priors::onnx::{Device, EndToEndNetwork, Runtime};
 use reconstruction::priors::{Denoiser, Encoder, Network, Networks};
 #[cfg(feature = "gpu")]
-use reconstruction::{
-    gpu::adapter::Gpu, operator::SensingOperator, priors::registry::PriorSpec, solver::reconstruct,
-};
+use reconstruction::{gpu::adapter::Gpu, operator::SensingOperator, solver::reconstruct};
 
 /// A network embedded in the program as ONNX files, so that only libonnxruntime has to be installed.
 #[derive(Debug, Clone, Copy)]
@@ -314,7 +312,7 @@ impl NetworkSource {
         })
     }
 
-    /// The GPU that runs stages of total variation, opened at the first call. `None` with `--device cpu` or `cuda:N`.
+    /// The GPU that runs the solver, opened at the first call. `None` with `--device cpu` or `cuda:N`.
     ///
     /// # Errors
     /// It can't be used.
@@ -328,13 +326,13 @@ impl NetworkSource {
         Ok(Some(Arc::clone(opened)))
     }
 
-    /// The GPU that runs the total variation of a schedule, for records. `None` if the CPU does.
-    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
-    pub fn gpu_name(&self, schedule: &Schedule) -> Option<String> {
+    /// The GPU that runs the solver, for records. `None` if the CPU does.
+    pub fn gpu_name(&self) -> Option<String> {
         #[cfg(feature = "gpu")]
-        if schedule.stages.iter().any(|stage| matches!(stage.prior, PriorSpec::Tv(_))) {
-            return Some(self.gpu().ok()??.name().to_owned());
+        {
+            Some(self.gpu().ok()??.name().to_owned())
         }
+        #[cfg(not(feature = "gpu"))]
         None
     }
 

@@ -167,7 +167,7 @@ pub struct CostRecord {
     pub provider: Option<String>,
     /// Version of ONNX Runtime. `None` without a network.
     pub onnxruntime: Option<String>,
-    /// Name and driver of the GPU that ran stages of total variation. `None` if the CPU did.
+    /// Name and driver of the GPU that ran the solver. `None` if the CPU did.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gpu: Option<String>,
     pub cpu_seconds: f64,

@@ -20,6 +20,9 @@ pub struct Gpu {
     pub(super) queue: Queue,
     pub(super) kernels: Kernels,
     fault: Arc<Mutex<Option<Fault>>>,
+    /// Number of bytes that were copied to the host.
+    #[cfg(test)]
+    pub(super) read_bytes: std::sync::atomic::AtomicU64,
 }
 
 /// The compiled kernels.
@@ -28,6 +31,7 @@ pub(super) struct Kernels {
     pub(super) variation_along_time: ComputePipeline,
     pub(super) variation: ComputePipeline,
     pub(super) finish: ComputePipeline,
+    pub(super) hold_out: ComputePipeline,
     pub(super) limit_outliers: ComputePipeline,
     pub(super) analyse: ComputePipeline,
     pub(super) shrink: ComputePipeline,
@@ -42,17 +46,25 @@ enum Fault {
     Other(String),
 }
 
+/// Why the device has no room for buffers.
+pub(super) enum Shortage {
+    /// A buffer exceeds the largest size in bytes.
+    Limit { largest: u64, limit: u64 },
+    /// The driver has no memory for all buffers, in bytes.
+    Memory { total: u64, reason: String },
+}
+
 impl Gpu {
     /// Opens the first GPU with a Vulkan driver. Separate cards come before those of the processor.
     ///
     /// # Errors
     /// There is none, or it lacks what the kernels need.
     pub fn open() -> Result<Self> {
-        Self::open_with(|limits| limits)
+        Self::open_with(|_| ())
     }
 
-    /// As [`Gpu::open`], with limits derived from those that would be used.
-    pub(super) fn open_with(limits: impl FnOnce(Limits) -> Limits) -> Result<Self> {
+    /// As [`Gpu::open`], with a changed request for a device.
+    pub(super) fn open_with(change: impl FnOnce(&mut DeviceDescriptor<'_>)) -> Result<Self> {
         let mut descriptor = InstanceDescriptor::new_without_display_handle();
         (descriptor.backends, descriptor.flags) = (Backends::VULKAN, InstanceFlags::empty());
         let power_preference = PowerPreference::HighPerformance;
@@ -70,12 +82,13 @@ impl Gpu {
         let name = format!("{} ({})", info.name, driver.trim());
         let is_plain = |char: &char| char.is_ascii_graphic() || *char == ' ';
         let name: String = name.chars().filter(is_plain).take(64).collect();
-        let required_limits = limits(Limits {
+        let required_limits = Limits {
             max_buffer_size: has.max_buffer_size,
             max_storage_buffer_binding_size: has.max_storage_buffer_binding_size,
             ..Limits::default()
-        });
-        let descriptor = DeviceDescriptor { required_limits, ..Default::default() };
+        };
+        let mut descriptor = DeviceDescriptor { required_limits, ..Default::default() };
+        change(&mut descriptor);
         let opened = block_on(adapter.request_device(&descriptor));
         let (device, queue) = opened.map_err(|error| {
             ReconError::Runtime(format!("the GPU {name} can't run the solver's kernels: {error}"))
@@ -113,6 +126,7 @@ impl Gpu {
             variation_along_time: kernel("variation_along_time"),
             variation: kernel("variation"),
             finish: kernel("finish"),
+            hold_out: kernel("hold_out"),
             limit_outliers: nonlocal("limit_outliers"),
             analyse: nonlocal("analyse"),
             shrink: nonlocal("shrink"),
@@ -120,7 +134,15 @@ impl Gpu {
             low_rank: nonlocal("low_rank"),
             aggregate: nonlocal("aggregate"),
         };
-        let gpu = Self { name, device, queue, kernels, fault };
+        let gpu = Self {
+            name,
+            device,
+            queue,
+            kernels,
+            fault,
+            #[cfg(test)]
+            read_bytes: Default::default(),
+        };
         gpu.check()?;
         Ok(gpu)
     }
@@ -160,27 +182,42 @@ impl Gpu {
     /// # Errors
     /// The device or its free memory is too small.
     pub(super) fn buffers<const N: usize>(&self, lengths: [usize; N]) -> Result<[Buffer; N]> {
+        self.allocate(lengths).map_err(|shortage| self.refusal(&shortage))
+    }
+
+    /// As [`Gpu::buffers`], for callers that can do with smaller ones.
+    pub(super) fn allocate<const N: usize>(
+        &self,
+        lengths: [usize; N],
+    ) -> Result<[Buffer; N], Shortage> {
         let limits = self.device.limits();
         let limit = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         let bytes = |length: usize| 4 * length.max(4) as u64;
         let largest = lengths.into_iter().map(bytes).max().unwrap_or_default();
         if largest > limit {
-            return Err(ReconError::Runtime(format!(
-                "the GPU {} accepts arrays of up to {limit} bytes, but a tile needs {largest}: choose smaller tiles, \
-                 or use --device cpu",
-                self.name
-            )));
+            return Err(Shortage::Limit { largest, limit });
         }
         let scope = self.device.push_error_scope(ErrorFilter::OutOfMemory);
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
         let buffers = lengths.map(|length| self.buffer(bytes(length), usage));
         let total: u64 = lengths.into_iter().map(bytes).sum();
-        block_on(scope.pop()).map_or(Ok(buffers), |error| {
-            Err(ReconError::Runtime(format!(
-                "the GPU {} has too little free memory for {total} bytes: choose smaller tiles, run fewer workers on \
-                 this GPU, or use --device cpu ({error})",
-                self.name
-            )))
+        let failure = block_on(scope.pop());
+        failure
+            .map_or(Ok(buffers), |error| Err(Shortage::Memory { total, reason: error.to_string() }))
+    }
+
+    /// The error of a task for which the device is too small.
+    pub(super) fn refusal(&self, shortage: &Shortage) -> ReconError {
+        let name = &self.name;
+        ReconError::Runtime(match shortage {
+            Shortage::Limit { largest, limit } => format!(
+                "the GPU {name} accepts arrays of up to {limit} bytes, but a tile needs {largest}: choose smaller tiles, \
+                 or use --device cpu"
+            ),
+            Shortage::Memory { total, reason } => format!(
+                "the GPU {name} has too little free memory for {total} bytes: choose smaller tiles, run fewer workers \
+                 on this GPU, or use --device cpu ({reason})"
+            ),
         })
     }
 
@@ -200,6 +237,8 @@ impl Gpu {
         output: &mut [f32],
     ) -> Result<()> {
         let size = size_of_val(output) as u64;
+        #[cfg(test)]
+        self.read_bytes.fetch_add(size, std::sync::atomic::Ordering::Relaxed);
         let copy = self.buffer(size, BufferUsages::MAP_READ | BufferUsages::COPY_DST);
         commands.copy_buffer_to_buffer(buffer, 0, &copy, 0, size);
         self.queue.submit([commands.finish()]);
@@ -213,6 +252,17 @@ impl Gpu {
         let range = copy.get_mapped_range(..).map_err(|error| failed(&error))?;
         output.copy_from_slice(bytemuck::cast_slice(&range));
         Ok(())
+    }
+
+    /// Waits until all submitted commands are done.
+    ///
+    /// # Errors
+    /// As [`Gpu::check`].
+    pub(super) fn wait(&self) -> Result<()> {
+        let polled = self.device.poll(PollType::wait_indefinitely());
+        self.check()?;
+        let failed = |error| ReconError::Runtime(format!("the GPU {} failed: {error}", self.name));
+        polled.map(drop).map_err(failed)
     }
 
     pub(super) fn commands(&self) -> CommandEncoder {

@@ -9,8 +9,6 @@ struct Settings {
     // Frames of one snapshot, and of all snapshots.
     frames: u32,
     all_frames: u32,
-    // Offset of R C in `optics`.
-    directions: u32,
     // Workgroups of `project`, and of `variation`.
     pixel_groups: u32,
     block_groups: u32,
@@ -40,11 +38,11 @@ const MIN_SQUARE = 1e-30;
 // change and norm, and 1 at convergence; then one residual for each workgroup of `project`, and the two others for each
 // workgroup of `variation`.
 @group(0) @binding(1) var<storage, read_write> sums: array<f32>;
-// The masks C [B,H,W] and, unless R = 1, R C [B,H,W].
-@group(0) @binding(2) var<storage, read> optics: array<f32>;
+// The masks C [B,H,W].
+@group(0) @binding(2) var<storage, read> masks: array<f32>;
 // y, (H R H^T + gamma)^-1 and y1, each [S,H,W].
 @group(0) @binding(3) var<storage, read_write> pixels: array<f32>;
-// The frames [S B,H,W] that are projected: w, or v if there is no w.
+// The frames [S B,H,W] that are measured: w, or v if there is no w.
 @group(0) @binding(4) var<storage, read> start: array<f32>;
 // The projected frames; with ADMM, u is subtracted.
 @group(0) @binding(5) var<storage, read_write> x: array<f32>;
@@ -57,6 +55,12 @@ const MIN_SQUARE = 1e-30;
 @group(0) @binding(10) var<storage, read_write> dual_after: array<vec2<f32>>;
 // Dual field along time.
 @group(0) @binding(11) var<storage, read_write> field: array<f32>;
+// R C [B,H,W]; the masks if R = 1.
+@group(0) @binding(12) var<storage, read> directions: array<f32>;
+// Hold-out pixels, by their index in [S,H,W].
+@group(0) @binding(13) var<storage, read> held_out: array<u32>;
+// (y - H v)^2 of each of them.
+@group(0) @binding(14) var<storage, read_write> squares: array<f32>;
 
 const GROUP = 256u;
 const BATCH = 32u;
@@ -110,7 +114,7 @@ fn project(
         let first = pixel / plane * settings.frames * plane + at;
         var measured = 0.0;
         for (var k = 0u; k < settings.frames; k++) {
-            measured += optics[k * plane + at] * start[first + k * plane];
+            measured += masks[k * plane + at] * start[first + k * plane];
         }
         let y = pixels[pixel];
         square = (y - measured) * (y - measured);
@@ -122,7 +126,7 @@ fn project(
         let correction = (aim - measured) * pixels[count + pixel];
         for (var k = 0u; k < settings.frames; k++) {
             let voxel = first + k * plane;
-            var value = start[voxel] + optics[settings.directions + k * plane + at] * correction;
+            var value = start[voxel] + directions[k * plane + at] * correction;
             if has(ADMM) {
                 value -= u[voxel];
                 u[voxel] = value;
@@ -330,4 +334,27 @@ fn finish(@builtin(local_invocation_index) lane: u32) {
     sums[place + 3u] = select(0.0, 1.0, converged);
     sums[0] += 1.0;
     sums[1] = sums[place + 3u];
+}
+
+// The squared residual of each hold-out pixel.
+@compute @workgroup_size(256)
+fn hold_out(
+    @builtin(workgroup_id) id: vec3<u32>,
+    @builtin(num_workgroups) grid: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let slot = (id.y * grid.x + id.x) * GROUP + lane;
+    if slot >= arrayLength(&held_out) {
+        return;
+    }
+    let pixel = held_out[slot];
+    let plane = settings.width * settings.height;
+    let at = pixel % plane;
+    let first = pixel / plane * settings.frames * plane + at;
+    var measured = 0.0;
+    for (var k = 0u; k < settings.frames; k++) {
+        measured += masks[k * plane + at] * start[first + k * plane];
+    }
+    let residual = pixels[pixel] - measured;
+    squares[slot] = residual * residual;
 }

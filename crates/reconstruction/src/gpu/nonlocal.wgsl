@@ -15,6 +15,9 @@ struct Settings {
     // Square of the level of temporal shrinkage; 0 for none.
     level: f32,
     tau: f32,
+    // Rows of all frames that a band aggregates, from the first to the one after the last.
+    first_row: u32,
+    end_row: u32,
 }
 
 @group(0) @binding(0) var<uniform> settings: Settings;
@@ -31,10 +34,12 @@ struct Settings {
 @group(0) @binding(6) var<storage, read> windows: array<u32>;
 // Top left pixels of the patches of each group.
 @group(0) @binding(7) var<storage, read_write> groups: array<u32>;
-// The filtered patches.
+// The filtered patches of the groups of a band.
 @group(0) @binding(8) var<storage, read_write> patches: array<f32>;
-// For each place the end of its entries; then the entries, indices of patches in the order of their places.
+// For each place of a band the end of its entries; then the entries, indices of patches in the order of their places.
 @group(0) @binding(9) var<storage, read> entries: array<u32>;
+// The groups of a band.
+@group(0) @binding(10) var<storage, read> members: array<u32>;
 
 const GROUP = 256u;
 const SIDE = 6u;
@@ -262,10 +267,11 @@ fn low_rank(
     @builtin(num_workgroups) grid: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let group = id.y * grid.x + id.x;
-    if group >= settings.groups {
+    let slot = id.y * grid.x + id.x;
+    if slot >= settings.groups {
         return;
     }
+    let group = members[slot];
     if lane < PATCHES {
         let place = groups[group * PATCHES + lane];
         for (var p = 0u; p < PIXELS; p++) {
@@ -348,30 +354,34 @@ fn low_rank(
         value *= lower[i * PIXELS + i];
         solved[i * PATCHES + lane] = value;
         let pixel = noisy[place + i / SIDE * settings.width + i % SIDE];
-        patches[(group * PATCHES + lane) * PIXELS + i] = pixel - square * value;
+        patches[(slot * PATCHES + lane) * PIXELS + i] = pixel - square * value;
     }
 }
 
-// The mean of the filtered patches at a pixel, place by place and group by group.
+// The mean of the filtered patches at a pixel of a band, place by place and group by group.
 @compute @workgroup_size(256)
 fn aggregate(
     @builtin(workgroup_id) id: vec3<u32>,
     @builtin(num_workgroups) grid: vec3<u32>,
     @builtin(local_invocation_index) lane: u32,
 ) {
-    let voxel = index(id, grid, lane);
-    let plane = settings.width * settings.height;
-    let count = plane * settings.frames;
-    if voxel >= count {
+    let at = index(id, grid, lane);
+    let rows = settings.end_row - settings.first_row;
+    if at >= rows * settings.width * settings.frames {
         return;
     }
-    let row = voxel % plane / settings.width;
-    let column = voxel % settings.width;
+    let frame = at / (rows * settings.width);
+    let row = settings.first_row + at / settings.width % rows;
+    let column = at % settings.width;
+    // The places of a band begin with those of the patches that reach its first row.
+    let top = max(settings.first_row, SIDE - 1u) - (SIDE - 1u);
+    let place_rows = settings.end_row - top;
+    let count = place_rows * settings.width * settings.frames;
     var sum = 0.0;
     var cover = 0u;
     for (var i = 0u; i <= min(row, SIDE - 1u); i++) {
         for (var j = 0u; j <= min(column, SIDE - 1u); j++) {
-            let place = voxel - i * settings.width - j;
+            let place = (frame * place_rows + row - top - i) * settings.width + column - j;
             var first = 0u;
             if place > 0u {
                 first = entries[place - 1u];
@@ -383,6 +393,7 @@ fn aggregate(
         }
     }
     let value = sum / f32(cover);
+    let voxel = (frame * settings.height + row) * settings.width + column;
     frames[voxel] = value;
     guide[voxel] = value;
 }

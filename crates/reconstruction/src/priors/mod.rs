@@ -19,7 +19,7 @@ use schemars::Schema;
 use super::cores::Cores;
 use super::error::{ReconError, Result};
 #[cfg(feature = "gpu")]
-use super::gpu::adapter::Gpu;
+use super::gpu::{adapter::Gpu, resident::DeviceFrames};
 use super::projection::Projection;
 
 /// Frames, height and width of a clip.
@@ -77,6 +77,18 @@ pub trait Prior {
     /// # Errors
     /// A network fails.
     fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()>;
+
+    /// Denoises frames in the memory of a GPU, in place. A prior without kernels works on a copy.
+    ///
+    /// # Errors
+    /// As [`Prior::denoise`]; the GPU is lost.
+    #[cfg(feature = "gpu")]
+    fn denoise_on_gpu(&mut self, frames: &DeviceFrames, sigma: f32) -> Result<()> {
+        let mut copy = frames.read()?;
+        self.denoise(&mut copy, sigma)?;
+        frames.write(&copy);
+        Ok(())
+    }
 
     /// Projects, then denoises. A prior that can work on strips of rows overrides this, to keep a strip in cache between
     /// projection and denoising (see `tv.rs`).
@@ -191,7 +203,7 @@ pub trait Networks {
         Ok(None)
     }
 
-    /// The GPU that runs stages of total variation, opened at its first use. With none they run on the CPU.
+    /// The GPU that keeps the variables and runs the solver's kernels, opened at its first use. Without one the CPU does.
     ///
     /// # Errors
     /// It can't be used.

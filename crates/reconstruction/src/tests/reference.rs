@@ -27,7 +27,7 @@ const PULL: f64 = 0.25;
 /// Step of the dual ascent of total variation.
 const TAU: f64 = 0.25;
 
-struct Pull;
+pub(crate) struct Pull;
 
 impl Denoiser for Pull {
     fn denoise(&mut self, frames: &mut Array3<f32>, _: f32) -> Result<(), ReconError> {

@@ -9,6 +9,8 @@
 
 mod layout;
 mod low_rank;
+#[cfg(feature = "gpu")]
+pub(crate) mod on_gpu;
 mod search;
 mod temporal_shrinkage;
 
@@ -20,11 +22,11 @@ use serde::{Deserialize, Serialize};
 use super::{Family, Networks, Prior, Size, Spec, WorkingSet, noise_levels};
 use crate::cores::{Cores, share_with};
 use crate::error::Result;
-#[cfg(feature = "gpu")]
-use crate::gpu::nonlocal::{Clip, Levels};
 use crate::motion::Motion;
 use layout::{BATCH, PATCHES, PIXELS, SIDE, place_of, row_length};
 use low_rank::{BATCH_VALUES, Filter};
+#[cfg(feature = "gpu")]
+use on_gpu::OnGpu;
 use search::{Best, Line};
 use temporal_shrinkage::TemporalShrinkage;
 
@@ -112,9 +114,7 @@ impl Spec for NonlocalSpec {
         nonlocal.outlier_limit = self.outlier_limit.unwrap_or(f32::INFINITY);
         #[cfg(feature = "gpu")]
         if let Some(gpu) = networks.gpu()? {
-            let clip = Clip::new(gpu, size, nonlocal.temporal_shrinkage.cosines())?;
-            let shrinkage = self.temporal_shrinkage;
-            return Ok(Box::new(OnGpu { clip, settings: nonlocal, shrinkage }));
+            return Ok(Box::new(OnGpu::new(gpu, nonlocal, self.temporal_shrinkage)?));
         }
         Ok(Box::new(NonlocalPrior { nonlocal, shrinkage: self.temporal_shrinkage }))
     }
@@ -132,51 +132,8 @@ impl Prior for NonlocalPrior {
     }
 }
 
-/// The prior with its clip on a GPU, and the settings of the prior on the CPU.
-#[cfg(feature = "gpu")]
-struct OnGpu {
-    clip: Clip,
-    settings: Nonlocal,
-    shrinkage: f32,
-}
-
-#[cfg(feature = "gpu")]
-impl Prior for OnGpu {
-    fn denoise(&mut self, frames: &mut Array3<f32>, sigma: f32) -> Result<()> {
-        let Self { clip, settings, shrinkage } = self;
-        let size: Size = frames.dim();
-        if size.1 < SIDE || size.2 < SIDE {
-            return Ok(());
-        }
-        let levels = Levels {
-            margin: settings.outlier_limit * sigma,
-            shrinkage: *shrinkage * sigma,
-            tau: STRENGTH * PATCHES as f32 * sigma * sigma,
-        };
-        let mut values: Vec<f32> = frames.iter().copied().collect();
-        clip.load(&values, levels);
-        if settings.passes == 0 {
-            clip.guide_by_frames();
-        }
-        if settings.passes.is_multiple_of(REFRESH) {
-            let motion = if settings.motion_compensation {
-                let guide = clip.guide()?;
-                let guide = ArrayView3::from_shape(size, &guide).expect("a clip");
-                Motion::of(guide, &settings.cores)
-            } else {
-                Motion::none()
-            };
-            clip.search(&search::windows(size, settings.passes / REFRESH, &motion))?;
-        }
-        settings.passes += 1;
-        clip.filter(levels, &mut values)?;
-        frames.iter_mut().zip(values).for_each(|(frame, value)| *frame = value);
-        Ok(())
-    }
-}
-
 /// Number of iterations for which groups are kept.
-const REFRESH: usize = 4;
+pub(crate) const REFRESH: usize = 4;
 /// `tau` in units of `PATCHES sigma^2`, the eigenvalue that noise alone would have.
 const STRENGTH: f32 = 4.0;
 /// Distance by which a pixel may exceed the range of its eight neighbours, in units of `sigma`. An isolated outlier spans
@@ -551,7 +508,7 @@ mod tests {
     use pulp::Arch;
     use rand::{RngExt, SeedableRng};
 
-    fn noisy(size: (usize, usize, usize), sigma: f32) -> (Array3<f32>, Array3<f32>) {
+    pub(super) fn noisy(size: (usize, usize, usize), sigma: f32) -> (Array3<f32>, Array3<f32>) {
         let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(5);
         let clean = Array3::from_shape_fn(size, |(k, i, j)| {
             0.5 + 0.3 * ((i + 2 * k) as f32 * 0.25).sin() * ((j + k) as f32 * 0.2).cos()
@@ -602,7 +559,7 @@ mod tests {
     }
 
     /// The prior in 64 bits: every distance, every group and every system of equations one after the other.
-    struct Reference {
+    pub(super) struct Reference {
         guide: Array3<f32>,
         /// Frames, rows and columns of the patches of each group.
         groups: Vec<Vec<(usize, usize, usize)>>,
@@ -629,7 +586,11 @@ mod tests {
     }
 
     impl Reference {
-        fn denoise(&mut self, clip: &mut Array3<f32>, sigma: f32, shrinkage: f32) {
+        pub(super) fn new(clip: &Array3<f32>) -> Self {
+            Self { guide: clip.clone(), groups: Vec::new(), passes: 0 }
+        }
+
+        pub(super) fn denoise(&mut self, clip: &mut Array3<f32>, sigma: f32, shrinkage: f32) {
             *clip = limited(clip, OUTLIER_LIMIT * sigma);
             if shrinkage > 0.0 {
                 *clip = temporal_shrinkage::tests::shrunk(clip, f64::from(shrinkage * sigma));
@@ -736,7 +697,7 @@ mod tests {
     }
 
     /// Values whose distances have no rounding: the search must find the same patches.
-    fn coarse(size: (usize, usize, usize)) -> Array3<f32> {
+    pub(super) fn coarse(size: (usize, usize, usize)) -> Array3<f32> {
         noisy(size, 0.1).1.mapv(|x| (x * 256.0).round() / 256.0)
     }
 
@@ -747,7 +708,7 @@ mod tests {
             let mut expected = coarse(size);
             let mut found = expected.clone();
             let mut prior = Nonlocal::new(size);
-            let mut reference = Reference { guide: found.clone(), groups: Vec::new(), passes: 0 };
+            let mut reference = Reference::new(&found);
             for (pass, shrinkage) in [0.0, 1.5].into_iter().enumerate() {
                 prior.denoise(&mut found, 0.08, shrinkage);
                 reference.denoise(&mut expected, 0.08, shrinkage);
@@ -755,59 +716,6 @@ mod tests {
                 assert!(worst < 2e-5, "{size:?} pass {pass}: {worst}");
             }
         }
-    }
-
-    /// Two searches, and a run that gives the same bits.
-    #[cfg(feature = "gpu")]
-    #[test]
-    fn passes_on_a_gpu_are_those_of_the_reference() {
-        use super::{Networks, NonlocalSpec, Spec};
-        use crate::gpu::tests::{On, gpu};
-        let Some(gpu) = gpu() else { return };
-        let mut networks = On(gpu);
-        let mut largest = 0.0f32;
-        for (size, shrinkage) in [((2, 23, 26), 0.0), ((5, 12, 17), 1.5), ((1, 6, 9), 1.5)] {
-            let mut run = |passes: usize| {
-                let spec = NonlocalSpec::new([0.08; 2], shrinkage);
-                let mut prior = spec.start(size, &mut networks).unwrap();
-                let mut found = coarse(size);
-                let mut results = Vec::new();
-                for _ in 0..passes {
-                    prior.denoise(&mut found, 0.08).unwrap();
-                    results.push(found.clone());
-                }
-                results
-            };
-            let found = run(REFRESH + 2);
-            assert_eq!(found, run(REFRESH + 2), "runs differ");
-            let mut expected = coarse(size);
-            let mut reference =
-                Reference { guide: expected.clone(), groups: Vec::new(), passes: 0 };
-            for (pass, found) in found.iter().enumerate().take(2) {
-                reference.denoise(&mut expected, 0.08, shrinkage);
-                let worst = (found - &expected).mapv(f32::abs).fold(0.0, |a: f32, &b| a.max(b));
-                assert!(worst < 1e-4, "{size:?} pass {pass}: {worst}");
-                largest = largest.max(worst);
-            }
-            assert!(found.iter().flatten().all(|value| value.is_finite()));
-        }
-        eprintln!("largest difference: {largest:e}");
-        // Texture that moves out of the search window: the GPU follows the same motion as the CPU.
-        let mut rng = rand::rngs::ChaCha8Rng::seed_from_u64(6);
-        let fine = Array2::from_shape_fn((120, 120), |_| rng.random::<f32>());
-        let video = Array3::from_shape_fn((6, 72, 96), |(k, i, j)| {
-            let (i, j) = (i + 40 - 6 * k, j + 3 * k);
-            0.3 * fine[[i, j]] + 0.2 * ((i as f32 / 9.0).sin() + (j as f32 / 11.0).cos())
-        });
-        let on_device = |networks: &mut dyn Networks| {
-            let mut found = video.clone();
-            let mut prior = NonlocalSpec::new([0.05; 2], 0.4).start(found.dim(), networks).unwrap();
-            prior.denoise(&mut found, 0.05).unwrap();
-            found
-        };
-        let difference = &on_device(&mut networks) - &on_device(&mut ());
-        let worst = difference.mapv(f32::abs).fold(0.0, |a: f32, &b| a.max(b));
-        assert!(worst < 1e-4, "along the motion: {worst}");
     }
 
     /// More batches of groups than are filtered at once.
