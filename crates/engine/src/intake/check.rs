@@ -77,7 +77,7 @@ pub fn masks(
     check_masks(&mut measured, opened.full_scale, sink).map_err(IntakeError::format(opened.name))
 }
 
-/// A reader that replaces the pixels of a map [H,W] by NaN.
+/// A reader that replaces the pixels of a map \[H,W\] by NaN.
 struct WithoutBad<'a> {
     reader: Box<dyn FrameReader + Send>,
     bad: Option<&'a Array2<bool>>,
