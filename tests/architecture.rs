@@ -27,7 +27,7 @@ const SOURCES: [&str; 7] = [
 /// Crates and modules that only these files and folders may name.
 const OWNERS: &[(&str, &[&str])] = &[
     ("ort", &["crates/reconstruction/src/priors/onnx.rs"]),
-    ("wgpu", &["crates/reconstruction/src/gpu/"]),
+    ("wgpu", &["crates/reconstruction/src/gpu/", "crates/reconstruction/src/resident.rs"]),
     ("sqlx", &["crates/store/src/"]),
     ("axum", &["src/http/", "src/cli/serve.rs"]),
     ("async_nats", &["crates/workers/src/nats/"]),

@@ -103,7 +103,8 @@ const KERNEL_FRAMES: usize = 8;
 /// The GPU, and for each side the megavoxels per second of each kernel and of their loop.
 #[cfg(feature = "gpu")]
 fn kernels(sides: &[u16]) -> Result<serde_json::Value> {
-    use reconstruction::gpu::{adapter::Gpu, speed::measure};
+    use reconstruction::gpu::adapter::Gpu;
+    use reconstruction::speed::measure;
 
     let gpu = std::sync::Arc::new(Gpu::open()?);
     let mut report = serde_json::json!({"gpu": gpu.name(), "mvoxel_per_s": {}});

@@ -84,7 +84,7 @@ pub(crate) fn run_stage(
     Ok(false)
 }
 
-/// One iteration, on the variables in `iterate`. On a GPU, the kernels of `gpu/resident.rs` do the same.
+/// One iteration, on the variables in `iterate`. On a GPU, the kernels of `resident.rs` do the same.
 fn iterate(
     problem: Problem<'_>,
     settings: &Settings,

@@ -37,11 +37,15 @@ pub mod quality;
 #[path = "tests/reference.rs"]
 mod reference;
 pub mod registration;
+#[cfg(feature = "gpu")]
+mod resident;
 pub mod scale;
 pub mod schedule;
 pub mod sequence;
 pub mod signs;
 pub mod solver;
+#[cfg(feature = "gpu")]
+pub mod speed;
 pub mod stage;
 mod state;
 mod static_regions;

@@ -6,11 +6,13 @@ use ndarray::Array3;
 
 use super::error::Result;
 #[cfg(feature = "gpu")]
-use super::gpu::resident::{Copies, DeviceFrames, Resident};
+use super::gpu::frames::DeviceFrames;
 use super::hold_out::HoldOut;
 use super::iterate::{Iterate, Variables};
 use super::priors::Networks;
 use super::projection::{Problem, Settings};
+#[cfg(feature = "gpu")]
+use super::resident::{Copies, Resident};
 use super::stage::Stage;
 
 /// The variables that one iteration hands to the next. They stay where they are from the first stage to the last.

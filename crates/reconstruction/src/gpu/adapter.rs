@@ -16,28 +16,28 @@ use crate::error::{ReconError, Result};
 /// An open GPU. Threads may share it.
 pub struct Gpu {
     name: String,
-    pub(super) device: Device,
-    pub(super) queue: Queue,
-    pub(super) kernels: Kernels,
+    pub(crate) device: Device,
+    pub(crate) queue: Queue,
+    pub(crate) kernels: Kernels,
     fault: Arc<Mutex<Option<Fault>>>,
     /// Number of bytes that were copied to the host.
     #[cfg(test)]
-    pub(super) read_bytes: std::sync::atomic::AtomicU64,
+    pub(crate) read_bytes: std::sync::atomic::AtomicU64,
 }
 
 /// The compiled kernels.
-pub(super) struct Kernels {
-    pub(super) project: ComputePipeline,
-    pub(super) variation_along_time: ComputePipeline,
-    pub(super) variation: ComputePipeline,
-    pub(super) finish: ComputePipeline,
-    pub(super) hold_out: ComputePipeline,
-    pub(super) limit_outliers: ComputePipeline,
-    pub(super) analyse: ComputePipeline,
-    pub(super) shrink: ComputePipeline,
-    pub(super) search: ComputePipeline,
-    pub(super) low_rank: ComputePipeline,
-    pub(super) aggregate: ComputePipeline,
+pub(crate) struct Kernels {
+    pub(crate) project: ComputePipeline,
+    pub(crate) variation_along_time: ComputePipeline,
+    pub(crate) variation: ComputePipeline,
+    pub(crate) finish: ComputePipeline,
+    pub(crate) hold_out: ComputePipeline,
+    pub(crate) limit_outliers: ComputePipeline,
+    pub(crate) analyse: ComputePipeline,
+    pub(crate) shrink: ComputePipeline,
+    pub(crate) search: ComputePipeline,
+    pub(crate) low_rank: ComputePipeline,
+    pub(crate) aggregate: ComputePipeline,
 }
 
 /// A failure that the driver reports outside of calls.
@@ -47,7 +47,7 @@ enum Fault {
 }
 
 /// Why the device has no room for buffers.
-pub(super) enum Shortage {
+pub(crate) enum Shortage {
     /// A buffer exceeds the largest size in bytes.
     Limit { largest: u64, limit: u64 },
     /// The driver has no memory for all buffers, in bytes.
@@ -64,7 +64,7 @@ impl Gpu {
     }
 
     /// As [`Gpu::open`], with a changed request for a device.
-    pub(super) fn open_with(change: impl FnOnce(&mut DeviceDescriptor<'_>)) -> Result<Self> {
+    pub(crate) fn open_with(change: impl FnOnce(&mut DeviceDescriptor<'_>)) -> Result<Self> {
         let mut descriptor = InstanceDescriptor::new_without_display_handle();
         (descriptor.backends, descriptor.flags) = (Backends::VULKAN, InstanceFlags::empty());
         let power_preference = PowerPreference::HighPerformance;
@@ -156,7 +156,7 @@ impl Gpu {
     ///
     /// # Errors
     /// [`ReconError::DeviceLost`] from the loss of the device on, [`ReconError::Runtime`] once after another fault.
-    pub(super) fn check(&self) -> Result<()> {
+    pub(crate) fn check(&self) -> Result<()> {
         let fault = || self.fault.lock().unwrap_or_else(PoisonError::into_inner);
         if fault().is_none() {
             return Ok(());
@@ -181,12 +181,12 @@ impl Gpu {
     ///
     /// # Errors
     /// The device or its free memory is too small.
-    pub(super) fn buffers<const N: usize>(&self, lengths: [usize; N]) -> Result<[Buffer; N]> {
+    pub(crate) fn buffers<const N: usize>(&self, lengths: [usize; N]) -> Result<[Buffer; N]> {
         self.allocate(lengths).map_err(|shortage| self.refusal(&shortage))
     }
 
     /// As [`Gpu::buffers`], for callers that can do with smaller ones.
-    pub(super) fn allocate<const N: usize>(
+    pub(crate) fn allocate<const N: usize>(
         &self,
         lengths: [usize; N],
     ) -> Result<[Buffer; N], Shortage> {
@@ -207,7 +207,7 @@ impl Gpu {
     }
 
     /// The error of a task for which the device is too small.
-    pub(super) fn refusal(&self, shortage: &Shortage) -> ReconError {
+    pub(crate) fn refusal(&self, shortage: &Shortage) -> ReconError {
         let name = &self.name;
         ReconError::Runtime(match shortage {
             Shortage::Limit { largest, limit } => format!(
@@ -221,7 +221,7 @@ impl Gpu {
         })
     }
 
-    pub(super) fn buffer(&self, size: u64, usage: BufferUsages) -> Buffer {
+    pub(crate) fn buffer(&self, size: u64, usage: BufferUsages) -> Buffer {
         let descriptor = BufferDescriptor { label: None, size, usage, mapped_at_creation: false };
         self.device.create_buffer(&descriptor)
     }
@@ -230,7 +230,7 @@ impl Gpu {
     ///
     /// # Errors
     /// As [`Gpu::check`].
-    pub(super) fn read(
+    pub(crate) fn read(
         &self,
         mut commands: CommandEncoder,
         buffer: &Buffer,
@@ -258,14 +258,14 @@ impl Gpu {
     ///
     /// # Errors
     /// As [`Gpu::check`].
-    pub(super) fn wait(&self) -> Result<()> {
+    pub(crate) fn wait(&self) -> Result<()> {
         let polled = self.device.poll(PollType::wait_indefinitely());
         self.check()?;
         let failed = |error| ReconError::Runtime(format!("the GPU {} failed: {error}", self.name));
         polled.map(drop).map_err(failed)
     }
 
-    pub(super) fn commands(&self) -> CommandEncoder {
+    pub(crate) fn commands(&self) -> CommandEncoder {
         self.device.create_command_encoder(&Default::default())
     }
 }

@@ -1,9 +1,8 @@
-//! Iterations with total variation, and the nonlocal prior, on a GPU of any vendor. The kernels are in `kernels.wgsl` and
-//! `nonlocal.wgsl`.
+//! A GPU of any vendor, frames in its memory, and the nonlocal prior. The kernels are in `kernels.wgsl` (iterations and
+//! total variation, which `resident.rs` runs) and `nonlocal.wgsl`.
 
 pub mod adapter;
+pub(crate) mod frames;
 pub(crate) mod nonlocal;
-pub(crate) mod resident;
-pub mod speed;
 #[cfg(test)]
 pub(crate) mod tests;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use wgpu::{BindGroupDescriptor, BindGroupEntry, Buffer, BufferUsages, ComputePipeline};
 
 use super::adapter::{Gpu, Shortage};
-use super::resident::{DeviceFrames, GROUP, grid};
+use super::frames::{DeviceFrames, GROUP, grid};
 use crate::error::Result;
 
 /// Frames, height and width of a clip.

@@ -14,7 +14,6 @@ use wgpu::MemoryHints;
 
 use super::adapter::Gpu;
 use super::nonlocal::Clip;
-use super::speed;
 use crate::error::{ReconError, Result};
 use crate::gap::{Solver, run_stage};
 use crate::hold_out::HoldOut;
@@ -29,7 +28,7 @@ use crate::stage::Stage;
 use crate::state::State;
 use crate::tile::{Tile, TilePlan, Window};
 use crate::unmeasured::Measured;
-use crate::{admm, gap, pilot, projection};
+use crate::{admm, gap, pilot, projection, speed};
 
 /// Largest difference, relative to the largest value.
 const TOLERANCE: f64 = 1e-4;

@@ -19,7 +19,7 @@ use schemars::Schema;
 use super::cores::Cores;
 use super::error::{ReconError, Result};
 #[cfg(feature = "gpu")]
-use super::gpu::{adapter::Gpu, resident::DeviceFrames};
+use super::gpu::{adapter::Gpu, frames::DeviceFrames};
 use super::projection::Projection;
 
 /// Frames, height and width of a clip.

@@ -8,8 +8,8 @@ use super::layout::{PATCHES, SIDE};
 use super::{Nonlocal, REFRESH, STRENGTH, search};
 use crate::error::Result;
 use crate::gpu::adapter::Gpu;
+use crate::gpu::frames::DeviceFrames;
 use crate::gpu::nonlocal::{Clip, Levels, NamedKernel};
-use crate::gpu::resident::DeviceFrames;
 use crate::motion::Motion;
 use crate::priors::Prior;
 

@@ -1,4 +1,4 @@
-//! Speed of the kernels.
+//! Speed of the kernels of a GPU.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use ndarray::Array3;
 
-use super::adapter::Gpu;
-use super::nonlocal::NamedKernel;
-use super::resident::{DeviceFrames, Resident};
 use crate::error::Result;
+use crate::gpu::adapter::Gpu;
+use crate::gpu::frames::DeviceFrames;
+use crate::gpu::nonlocal::NamedKernel;
 use crate::iterate::Variables;
 use crate::operator::{SensingOperator, Statistics};
 use crate::priors::Prior;
@@ -18,6 +18,7 @@ use crate::priors::nonlocal::{Nonlocal, REFRESH};
 use crate::priors::registry::PriorSpec;
 use crate::priors::tv::TvSpec;
 use crate::projection::{Problem, Settings};
+use crate::resident::Resident;
 use crate::schedule::Schedule;
 
 /// Shortest measurement.

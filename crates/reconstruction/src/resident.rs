@@ -4,11 +4,11 @@ use std::collections::VecDeque;
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{Array3, ArrayView3};
 use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, Buffer, BufferUsages, ComputePipeline};
 
-use super::adapter::Gpu;
 use crate::error::{ReconError, Result};
+use crate::gpu::adapter::Gpu;
+use crate::gpu::frames::{DeviceFrames, GROUP, grid, upload};
 use crate::iterate::{Change, Variables};
 use crate::operator::Statistics;
 use crate::priors::registry::PriorSpec;
@@ -17,9 +17,7 @@ use crate::priors::{Prior, Size};
 use crate::projection::{Problem, Settings, Step};
 use crate::stage::Stage;
 
-// These constants are repeated in `kernels.wgsl`.
-/// Lanes of a workgroup.
-pub(super) const GROUP: usize = 256;
+// These constants are repeated in `gpu/kernels.wgsl`.
 /// Largest number of iterations between two reads of their sums.
 const BATCH: usize = 32;
 /// Position of the first part of a sum.
@@ -35,69 +33,12 @@ const ADMM: u32 = 2;
 const EXTRAPOLATED: u32 = 4;
 const FIRST: u32 = 8;
 const LAST: u32 = 16;
-
-/// Largest number of workgroups in one dimension of a dispatch.
-const MAX_GROUPS: u32 = 65_535;
 /// Voxels that one batch may process: enough to hide the latency of a read, and far from the driver's time limit.
 const BATCH_VOXELS: usize = 1 << 26;
 
-/// Frames \[S B,H,W\] in the memory of a GPU.
-#[derive(Clone)]
-pub struct DeviceFrames {
-    gpu: Arc<Gpu>,
-    size: Size,
-    pub(super) buffer: Buffer,
-}
-
-impl DeviceFrames {
-    /// Frames of this size, all 0.
-    ///
-    /// # Errors
-    /// The GPU is too small or lost.
-    pub(crate) fn zeros(gpu: Arc<Gpu>, size: Size) -> Result<Self> {
-        let [buffer] = gpu.buffers([size.0 * size.1 * size.2])?;
-        Ok(Self { gpu, size, buffer })
-    }
-
-    /// Copies frames of the same size, in standard layout, to the GPU.
-    pub(crate) fn write(&self, frames: &Array3<f32>) {
-        debug_assert_eq!(frames.dim(), self.size);
-        upload(&self.gpu, &self.buffer, 0, frames.view());
-    }
-
-    /// Copies the frames to the host.
-    ///
-    /// # Errors
-    /// The GPU is lost.
-    pub(crate) fn read(&self) -> Result<Array3<f32>> {
-        let mut values = vec![0.0; self.size.0 * self.size.1 * self.size.2];
-        self.gpu.read(self.gpu.commands(), &self.buffer, &mut values)?;
-        let frames = Array3::from_shape_vec(self.size, values);
-        Ok(frames.unwrap_or_else(|_| unreachable!("as many values as voxels")))
-    }
-
-    /// A copy in the memory of the GPU.
-    ///
-    /// # Errors
-    /// The GPU is too small or lost.
-    pub(crate) fn copied(&self) -> Result<Self> {
-        let copy = Self::zeros(Arc::clone(&self.gpu), self.size)?;
-        let mut commands = self.gpu.commands();
-        commands.copy_buffer_to_buffer(&self.buffer, 0, &copy.buffer, 0, None);
-        self.gpu.queue.submit([commands.finish()]);
-        Ok(copy)
-    }
-}
-
-/// Copies an array in standard layout to a buffer, from the value at `offset` on.
-fn upload(gpu: &Gpu, buffer: &Buffer, offset: usize, values: ArrayView3<'_, f32>) {
-    let values = values.to_slice().unwrap_or_else(|| unreachable!("arrays in standard layout"));
-    gpu.queue.write_buffer(buffer, 4 * offset as u64, bytemuck::cast_slice(values));
-}
-
 /// A dispatch of a kernel.
-pub(super) struct Pass {
-    pub(super) name: &'static str,
+pub(crate) struct Pass {
+    pub(crate) name: &'static str,
     pipeline: ComputePipeline,
     bindings: BindGroup,
     groups: [u32; 3],
@@ -122,14 +63,14 @@ pub(crate) struct Resident {
     unused: [Buffer; 2],
     /// R C \[B,H,W\] of the last stage, unless R = 1, and the statistics from which it follows.
     directions: Option<(Statistics, Option<Buffer>)>,
-    pub(super) iterations: Iterations,
+    pub(crate) iterations: Iterations,
 }
 
 /// The iterations of a stage.
 #[derive(Default)]
-pub(super) struct Iterations {
+pub(crate) struct Iterations {
     /// The dispatches of one iteration. The first is the projection.
-    pub(super) passes: Vec<Pass>,
+    pub(crate) passes: Vec<Pass>,
     /// True if one of them is the prior.
     has_prior: bool,
     /// Iterations that are not submitted yet.
@@ -398,7 +339,7 @@ impl Resident {
     }
 
     /// Runs some of the passes as often as in a batch, and returns how often.
-    pub(super) fn repeat(&self, passes: Range<usize>) -> Result<usize> {
+    pub(crate) fn repeat(&self, passes: Range<usize>) -> Result<usize> {
         self.reset();
         self.run(passes, self.iterations.batch).map(|_| self.iterations.batch)
     }
@@ -523,10 +464,4 @@ fn dispatches(updates: usize) -> Vec<usize> {
         remaining -= remaining.min(others);
     }
     counts
-}
-
-/// Workgroups in two dimensions, at least `count`.
-pub(super) fn grid(count: usize) -> [u32; 3] {
-    let columns = (count as u32).clamp(1, MAX_GROUPS);
-    [columns, (count as u32).div_ceil(columns), 1]
 }
