@@ -22,9 +22,10 @@ test: runtime judges $(TRAINING)/.stamp ## run all tests
 
 # The driver of Debian's package chromium.
 VULKAN_ICD ?= /usr/lib/chromium/vk_swiftshader_icd.json
+# The whole workspace has the same dependencies as in `make test`, so that few are built again.
 test-gpu: ## test the feature gpu on software Vulkan: its kernels, and jobs of the service
-	VK_ICD_FILENAMES=$(VULKAN_ICD) $(CARGO) test --package sci-recon-reconstruction --lib --features gpu gpu
-	VK_ICD_FILENAMES=$(VULKAN_ICD) $(CARGO) test --features gpu --test service gpu::
+	VK_ICD_FILENAMES=$(VULKAN_ICD) $(CARGO) test --workspace --features gpu --lib gpu
+	VK_ICD_FILENAMES=$(VULKAN_ICD) $(CARGO) test --workspace --features gpu --test service gpu::
 
 deploy-check: judges runtime clients ## validate the samples under deploy/ and docker/ with the programs that read them, and use the service behind nginx and Caddy, also with generated clients
 	$(CARGO) build --quiet
