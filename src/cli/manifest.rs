@@ -57,8 +57,7 @@ struct Run {
 /// The requests that repeat the inputs of a job.
 #[derive(Debug, Deserialize)]
 struct Inputs {
-    #[serde(default)]
-    masks_sha256: Option<Sha256>,
+    masks_sha256: Sha256,
     calibration: Map<String, Value>,
     measurement: Map<String, Value>,
 }
@@ -451,7 +450,7 @@ mod tests {
             "schema": super::SCHEMA,
             "content": {
                 "program_version": "1",
-                "inputs": {"calibration": {}, "measurement": {}},
+                "inputs": {"masks_sha256": Sha256::of(b"masks"), "calibration": {}, "measurement": {}},
                 "request": {"tile": {"size": size}},
                 "snapshots": snapshots,
             },

@@ -11,7 +11,7 @@ const TOLERANCE: f32 = 1e-6;
 
 /// A mask whose largest value is below this share of the full scale is closed: no camera resolves it. The squares of its
 /// values, on which the projection divides, would leave the range of 32-bit floats.
-const MIN_OPEN: f32 = 1e-6;
+pub const MIN_OPEN: f32 = 1e-6;
 
 /// Statistics of masks on `[0,1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]

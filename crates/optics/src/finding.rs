@@ -241,7 +241,7 @@ findings! {
         "check that the masks are in the order in which the LCoS shows the patterns during a measurement";
 }
 
-/// What a finding of a measurement or a result questions, so that the verdict is doubtful.
+/// The part of a job that a finding makes doubtful. The verdict is then at best doubtful.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Doubt {
     /// The masks, their scale or the dark. There is no expected PSNR.
@@ -256,7 +256,7 @@ impl FindingCode {
         self.into()
     }
 
-    /// What the finding questions whatever its severity.
+    /// The part of a job that this finding makes doubtful, whether it is a warning or an error.
     pub fn doubt(self) -> Option<Doubt> {
         match self {
             Self::BadCalibration

@@ -94,12 +94,15 @@ impl Copies {
     /// # Errors
     /// The GPU is too small or lost.
     pub(crate) fn copied(&self) -> Result<Self> {
-        let copied =
-            |frames: &Option<DeviceFrames>| frames.as_ref().map(DeviceFrames::copied).transpose();
         // Restoring does not change y1.
         let (v, y1) = (self.v.copied()?, self.y1.clone());
-        Ok(Self { v, w: copied(&self.w)?, u: copied(&self.u)?, y1 })
+        Ok(Self { v, w: copied(self.w.as_ref())?, u: copied(self.u.as_ref())?, y1 })
     }
+}
+
+/// A copy of frames, if they are used.
+fn copied(frames: Option<&DeviceFrames>) -> Result<Option<DeviceFrames>> {
+    frames.map(DeviceFrames::copied).transpose()
 }
 
 impl Resident {
@@ -378,15 +381,14 @@ impl Resident {
     /// # Errors
     /// The GPU is too small or lost.
     pub(crate) fn snapshot(&self) -> Result<Copies> {
-        let copied =
-            |frames: &Option<DeviceFrames>| frames.as_ref().map(DeviceFrames::copied).transpose();
         let count = self.pixel_count();
         let [y1] = self.gpu.buffers([count])?;
         let mut commands = self.gpu.commands();
         let (first, bytes) = (8 * count as u64, 4 * count as u64);
         commands.copy_buffer_to_buffer(&self.pixels, first, &y1, 0, bytes);
         self.gpu.queue.submit([commands.finish()]);
-        Ok(Copies { v: self.v.copied()?, w: copied(&self.w)?, u: copied(&self.u)?, y1 })
+        let (w, u) = (copied(self.w.as_ref())?, copied(self.u.as_ref())?);
+        Ok(Copies { v: self.v.copied()?, w, u, y1 })
     }
 
     /// Goes back to a copy, and returns the frames `v` that it replaces. A stage must be started before the next iteration.

@@ -15,6 +15,7 @@ use crate::intake::error::Result;
 use crate::job::{CalibrationReport, Captures, Finding, MAX_CALIBRATION_SECONDS, planned_seconds};
 use formats::display::{Encoding, Picture};
 use formats::planar::{self, Reader};
+use formats::validate::MIN_OPEN;
 use formats::{
     self, Channels, FormatError, FrameReader, FullScale, Limits, SampleType, StackInfo,
     StackWriter, read_stack,
@@ -30,9 +31,6 @@ const BAND_BYTES: usize = 64 << 20;
 const PICTURE_SIDE: usize = 640;
 /// Share of averaging in the work. Writing and analysing the masks take a tenth each.
 const AVERAGING_SHARE: f64 = 0.8;
-
-/// Least brightness of the brightest mask pixel as a share of the white's. No camera resolves less.
-const MIN_SCALE: f32 = 1e-6;
 
 /// The captures of a calibration as paths.
 pub type CaptureFiles = Captures<PathBuf>;
@@ -205,7 +203,7 @@ fn average_masks(
         patterns.push(PatternFigures::new(&mask, capture.saturated, capture.drift));
     }
     writer.finish()?;
-    if scale < MIN_SCALE {
+    if scale < MIN_OPEN {
         return Err(IntakeError::content(
             "patterns",
             &"no pattern is brighter than the dark frames: check that the light was on and that the LCoS showed the \

@@ -423,7 +423,14 @@ pub fn find_library(stated: Option<&Path>) -> Result<PathBuf, NetworkError> {
     // An empty environment variable counts as not set.
     if let Some(library) = stated.filter(|path| !path.as_os_str().is_empty()) {
         return existing(library).ok_or_else(|| {
-            NetworkError::Missing(format!("there is no file {}", library.display()))
+            let path = library.display();
+            NetworkError::Missing(match library.try_exists() {
+                // Confined workers run as another user.
+                Err(error) => format!(
+                    "{path} can't be read ({error}); choose a folder that all users can read"
+                ),
+                Ok(_) => format!("there is no file {path}"),
+            })
         });
     }
     let executable = std::env::current_exe().and_then(|path| path.canonicalize());
