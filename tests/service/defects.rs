@@ -207,8 +207,8 @@ async fn the_service_leaves_out_what_was_not_measured() {
     }
     let mean = (stated[0].as_f64().unwrap() + stated[2].as_f64().unwrap()) / 2.0;
     assert_eq!(stated[1], Value::Null);
-    let of_job = ended["assessment"]["psnr_db"].as_f64().unwrap();
-    assert!((of_job - mean).abs() < 0.11, "{stated:?}: {of_job} dB");
+    let whole_job = ended["assessment"]["psnr_db"].as_f64().unwrap();
+    assert!((whole_job - mean).abs() < 0.11, "{stated:?}: {whole_job} dB");
     assert_eq!(ended["verdict"], "usable");
     for snapshot in 0..3 {
         let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/npy");

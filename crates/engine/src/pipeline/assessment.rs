@@ -45,7 +45,7 @@ const LEVELS_PER_DB: f32 = 4.0;
 const DARK: u8 = u8::MAX;
 /// The level of blocks that were not measured.
 const UNMEASURED: u8 = u8::MAX - 1;
-/// Expected PSNR of blocks that were not measured, in dB. That of half a picture was 6 dB, that of a tenth 8 to 12 dB.
+/// Expected PSNR of blocks that were not measured, in dB. Half a picture that the priors fill has 6 dB, a tenth 8 to 12 dB.
 const UNMEASURED_DB: f64 = 10.0;
 
 impl TileAssessment {
