@@ -47,6 +47,8 @@ struct MeasurementFacts {
     exposure_s: Option<f64>,
     sequence: Option<Sequence>,
     dark: Vec<Sha256>,
+    /// The stated value from which pixels are saturated; null if the measurement shows it.
+    saturation: Option<u32>,
     /// Findings of the check against the calibration. Every job of the measurement repeats them.
     warnings: Vec<Finding>,
     reading: Option<Reading>,
@@ -83,6 +85,7 @@ impl Shown for MeasurementId {
                         exposure_s: facts.exposure_s,
                         sequence: Some(facts.sequence),
                         dark: facts.dark,
+                        saturation: measurement.request.saturation,
                         warnings: facts.warnings,
                         reading: Some(facts.reading),
                     },
@@ -108,6 +111,7 @@ impl Shown for MeasurementId {
                 camera_fps: submission.camera_fps,
                 exposure_s: submission.exposure_s,
                 dark: submission.dark,
+                saturation: submission.saturation,
                 ..MeasurementFacts::default()
             },
         })

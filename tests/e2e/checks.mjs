@@ -32,6 +32,11 @@ export class Checks {
     return value;
   }
 
+  /** Waits until the text of an element satisfies `holds`, and returns it; the page draws after the service answers. */
+  async text(page, selector, holds, text) {
+    return this.until(() => page.textContent(selector), holds, text);
+  }
+
   /** Measures the time of a step. */
   async step(name, run) {
     const start = performance.now();

@@ -122,8 +122,8 @@ export async function matlab(page, checks, service) {
   const psnr = -10 * Math.log10(sum((at) => (frames[at] / scale - truth[at]) ** 2) / truth.length);
   checks.that(frames.length === 8 * 64 * 64 && psnr > 20, `the frames of a MATLAB file are right: ${psnr} dB`);
   const { verdict } = await service.call("GET", `/v1/jobs/${id}`);
-  const shown = await page.textContent(".judgement");
-  checks.that(["good", "usable"].includes(verdict) && shown.toLowerCase().includes(verdict), `the page shows the verdict ${verdict}: ${shown}`);
+  checks.that(["good", "usable"].includes(verdict), `the verdict is ${verdict}`);
+  await checks.text(page, ".judgement", (shown) => shown.toLowerCase().includes(verdict), `the page shows the verdict ${verdict}`);
   const ends = await checks.until(() => page.$$eval(".contrast .ends", (all) => all.map((one) => one.textContent)), (all) => all.some((one) => one.includes("61234")), "the largest count has all its digits");
   checks.that(!ends.some((one) => one.includes("61200")), `no count is rounded: ${ends}`);
   await checks.look(page, "matlab");
@@ -227,7 +227,7 @@ export async function colour(page, checks, scene) {
   await state(page, "succeeded");
   await page.waitForSelector(".downloads a >> text=Mosaic (npy)");
   checks.that((await page.$$(".tile")).length === 4, "each of the four sub-images is a tile");
-  checks.that(/red/.test(await page.textContent(".tile title")), "a tile names its colour");
+  await checks.text(page, ".tile title", (title) => /red/.test(title), "a tile names its colour");
   const share = () => page.evaluate(() => {
     const canvas = document.querySelector("[aria-label=Frames] .sight canvas");
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -400,7 +400,7 @@ export async function bands(page, checks, service, scene, count) {
   await page.goto(`${service.url}/#/compare/${one}/${other}`);
   await page.waitForSelector(".player output:text-is('band 1')");
   await checks.until(titles, ([left, right]) => left === "from 450 nm, band 1 · 450 nm" && right === "from 500 nm, band 1 · 500 nm", "each pane names its band");
-  checks.that((await page.textContent(".differs tr:has-text('Bands')")).includes("500 to 700 nm"), "the table has the wavelengths");
+  await checks.text(page, ".differs tr:has-text('Bands')", (row) => row.includes("500 to 700 nm"), "the table has the wavelengths");
   await checks.look(page, "compare-bands");
 }
 
@@ -426,7 +426,7 @@ export async function moved(page, checks) {
   await page.waitForSelector("section[aria-label=Registration] .shift path");
   await page.click("text=Save the moved masks as a calibration");
   await page.waitForSelector("section[aria-label=Registration] a[href^='#/calibrations/']");
-  const text = await page.textContent("section[aria-label=Registration]");
+  const text = await checks.text(page, "section[aria-label=Registration]", (card) => /by \S+ ± .* downwards and .* to the left/.test(card) && /from \S+ % to/.test(card), "the card describes the displacement");
   const [, down, left] = text.match(/by (\S+) ± 0\.\d+ pixels downwards and (\S+) ± 0\.\d+ pixels to the left/) ?? [];
   checks.that(Math.abs(down - 2) < 0.05 && Math.abs(left - 1) < 0.05, `the displacement is in words: ${text}`);
   checks.that(/from \S+ % to \S+ %/.test(text), `the gain is in words: ${text}`);
@@ -437,7 +437,7 @@ export async function moved(page, checks) {
 /** Watches a job until it has succeeded; its tiles must appear before that. */
 export async function watch(page, checks) {
   await page.waitForSelector(".tile.done", { timeout: 120_000 });
-  checks.that((await page.textContent(".head h1")) === HOSTILE, "the name is shown as text");
+  await checks.text(page, ".head h1", (name) => name === HOSTILE, "the name is shown as text");
   checks.that((await page.$$("main img")).length === 0, "the name creates no element");
   const bar = () => page.$eval(".progressline progress", (bar) => bar.value);
   const before = await bar();
@@ -452,8 +452,7 @@ export async function watch(page, checks) {
   await page.waitForSelector(".onpicture", { state: "hidden" });
   await page.waitForSelector(".downloads a[download]");
   await page.waitForSelector("section[aria-label='How it was made']:has-text('Done')");
-  const made = await page.textContent("section[aria-label='How it was made']");
-  checks.that(/at most (\d+) iterations per tile/.test(made), `iterations are counted as on the form: ${made}`);
+  await checks.text(page, "section[aria-label='How it was made']", (made) => /at most (\d+) iterations per tile/.test(made), "iterations are counted as on the form");
   await page.waitForSelector(".plot .line.residual");
   return early;
 }
@@ -720,11 +719,11 @@ export async function judged(page, checks, url, id) {
   await page.waitForSelector(".quality:has-text('SSIM')");
   const psnr = Number.parseFloat(await page.textContent(".quality:has-text('SSIM') b"));
   checks.that(psnr > 15 && psnr < 40, `the verdict shows the true PSNR: ${psnr}`);
-  checks.that((await page.textContent(".judgement")).length >= 3, "the verdict has words, too");
+  await checks.text(page, ".judgement", (verdict) => verdict.length >= 3, "the verdict has words, too");
   checks.that((await page.$(".quality:has-text('Expected PSNR')")) === null, "the measured PSNR replaces the expected one");
   await shows(page, checks, 0, () => page.selectOption("#mode", "error"), "the map of the expected error shows something");
   await checks.look(page, "job-error");
-  checks.that(/× full scale/.test(await page.textContent("[aria-label=Frames] .window")), "the bar under the error map has a unit");
+  await checks.text(page, "[aria-label=Frames] .window", (window) => /× full scale/.test(window), "the bar under the error map has a unit");
   await page.selectOption("#mode", "frame");
   const picture = await (await page.$(PICTURE)).boundingBox();
   checks.that(Math.abs(picture.width / picture.height - 1) < 0.02, `the frame has the shape of the square picture: ${JSON.stringify(picture)}`);
@@ -807,7 +806,7 @@ export async function manage(page, checks, label) {
   await page.click("dialog >> text=Keep");
   checks.that((await page.$(row)) !== null, "declining keeps the job");
   await page.check("[aria-label='Select all jobs']");
-  checks.that(!(await page.textContent("#delete-all")).endsWith(" 1"), "all jobs are selected");
+  await checks.text(page, "#delete-all", (button) => !button.endsWith(" 1"), "all jobs are selected");
   await page.uncheck("[aria-label='Select all jobs']");
   await page.check(`${row} input[type=checkbox]`);
   await page.click("#delete-all");

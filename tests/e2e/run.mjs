@@ -100,8 +100,7 @@ async function views(page, service) {
   await checks.look(page, "jobs");
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("table");
-  const lead = await page.textContent(".lead");
-  checks.that(/^(No job runs or waits|\d+ jobs? running, (none|\d+) waiting); 2 workers ready; [\d.]+ [KMGT]iB free\.$/.test(lead), `the state is one sentence: ${lead}`);
+  await checks.text(page, ".lead", (lead) => /^(No job runs or waits|\d+ jobs? running, (none|\d+) waiting); 2 workers ready; [\d.]+ [KMGT]iB free\.$/.test(lead), "the state is one sentence");
   await checks.look(page, "system");
   await page.goto(`${service.url}/#/calibrations`);
   await page.click(".calibration >> nth=0");

@@ -20,18 +20,19 @@ export async function faults(browser, checks, program, services) {
   const page = await checks.page(await browser.newContext(DESKTOP));
   await page.goto(`${service.url}/#/jobs/${bad.id}`);
   await page.waitForSelector(".judgement.bad, .judgement.usable");
-  checks.that(/Bad|Doubtful/.test(await page.textContent(".judgement")), "the verdict warns");
+  await checks.text(page, ".judgement", (verdict) => /Bad|Doubtful/.test(verdict), "the verdict warns");
+  await page.waitForSelector(".verdictcard .findings li");
   const found = await page.$$eval(".verdictcard .findings li", (lines) => lines.map((line) => line.textContent));
   checks.that(found.join().includes("What to do:"), "a finding shows its remedy");
   checks.that(found.filter((line) => line.includes("3 snapshots (0 to 2)")).length > 0 && !found.some((line) => /Snapshot [012]:/.test(line)), `a finding of all snapshots is one line: ${found}`);
   await page.waitForSelector("text=10 times slower than real time");
   await page.click("text=True speed");
   await page.waitForSelector("text=in real time");
-  checks.that((await page.inputValue("#rate")) === "80", "eight frames in 0.1 s are 80 frames per second");
+  await checks.until(() => page.inputValue("#rate"), (rate) => rate === "80", "eight frames in 0.1 s are 80 frames per second");
   await page.click("#play");
   await checks.look(page, "warning");
-  checks.that((await page.textContent(".head .badge")) === "finished", "only the verdict judges a job that has ended");
-  checks.that(/alone/.test(await page.textContent(".verdictcard > p:last-child")), "the check of the calibration alone doesn't contradict the findings");
+  await checks.text(page, ".head .badge", (badge) => badge === "finished", "only the verdict judges a job that has ended");
+  await checks.text(page, ".verdictcard > p:last-child", (text) => /alone/.test(text), "the check of the calibration alone doesn't contradict the findings");
   await withheld(page, checks);
   await doubted(page, checks, service);
   const stages = [{ prior: "tv", iterations: 10000, tv_weight: 0.05, tv_updates: 40, tolerance: 0 }];
@@ -93,7 +94,7 @@ async function doubted(page, checks, service) {
   checks.that(card.includes("While the finding no_dark stands") && !/masks have moved|they fit/.test(card), `an uncertain registration is no statement: ${card}`);
   const made = await (await page.waitForSelector("section[aria-label='How it was made']:has-text('Full scale')")).textContent();
   checks.that(/Full scale1000 counts: /.test(made) && /White level[\d.]+ counts \([\d.]+ × full scale\)/.test(made), `each number has its unit: ${made}`);
-  checks.that(/coded aperture/.test(await page.textContent(".verdictcard .findings")), "the remedy says how to record the dark");
+  await checks.text(page, ".verdictcard .findings", (text) => /coded aperture/.test(text), "the remedy says how to record the dark");
   await checks.look(page, "no-dark");
 }
 

@@ -704,6 +704,9 @@ async fn a_watched_folder_reports_files_that_it_skips() {
     let unreadable = std::ffi::OsString::from_vec(b"bench/\xff.npy".to_vec());
     std::fs::write(lab.folder.path().join(unreadable), SCENE.snapshots()).unwrap();
     lab.write("bench/notes.txt", b"");
+    lab.write("bench/a\u{1b}[2Jb.npy", &SCENE.snapshots());
+    let long = format!("{}.npy", "x".repeat(230));
+    lab.write(&format!("bench/{long}"), &SCENE.snapshots());
     let watch = ["watch-folder", "bench", "--once", "--settle-seconds", "0.1"];
     let watched = lab.run(&[&watch[..], &["--masks", "masks.npy"]].concat()).await;
     let text = String::from_utf8(watched.stdout).unwrap();
@@ -712,12 +715,14 @@ async fn a_watched_folder_reports_files_that_it_skips() {
         "empty.npy is skipped: the file is empty",
         "link.npy is skipped: it is a symbolic link",
         "is not UTF-8",
+        "a\u{fffd}[2Jb.npy is skipped: the name has control characters",
+        "x.npy is skipped: the name has more than 230 bytes",
     ] {
         assert_eq!(text.matches(expected).count(), 1, "{text}");
     }
     assert!(!text.contains("notes.txt"), "{text}");
     let errors = String::from_utf8(watched.stderr).unwrap();
-    assert!(errors.contains("3 files were skipped"), "{errors}");
+    assert!(errors.contains("5 files were skipped"), "{errors}");
 
     // Archives are submitted. Bytes without a header are, too, if their packing is stated.
     std::fs::create_dir(lab.path("kinds")).unwrap();

@@ -129,6 +129,40 @@ fn bad_pixels_are_left_out_in_every_algorithm() {
     assert!(codes(&report["findings"]).contains(&"bad_pixels"), "{report:#}");
 }
 
+/// Frames are a guess where a part of the sensor is frozen or was not measured, and the verdict says so.
+#[test]
+fn the_expected_psnr_counts_parts_that_were_not_measured() {
+    let (masks, y) = (masks(), snapshot());
+    let lost = |height: usize, value: f32| {
+        let is_lost = move |at: usize| at / 96 < height && at % 96 < 64;
+        float(y.iter().enumerate().map(|(at, y)| if is_lost(at) { value } else { *y }))
+    };
+    let expected = |report: &Value| {
+        let assessment = &report["assessment"];
+        ["psnr_low_db", "psnr_db", "psnr_high_db"].map(|name| assessment[name].as_f64().unwrap())
+    };
+    let (plain, _) = reconstruct(&masks, float(y.iter().copied()), &TV);
+    let [_, whole, _] = expected(&plain);
+    for (height, value, words) in [
+        (18, 1.7, "was frozen"),
+        (32, f32::NAN, "33.3 % of the picture lies in areas without a measured pixel"),
+        (64, f32::NAN, "pixels are marked as not measured"),
+    ] {
+        let (report, found) = reconstruct(&masks, lost(height, value), &TV);
+        let text = report["findings"].to_string();
+        assert!(text.contains(words), "{text}");
+        if height == 64 {
+            // Two thirds of the picture are missing.
+            assert_eq!(report["assessment"]["psnr_db"], Value::Null, "{report:#}");
+            continue;
+        }
+        let [low, stated, high] = expected(&report);
+        assert!(stated < whole - 3.0, "{stated} dB, {whole} dB of the whole picture");
+        assert!(low < found && found < high, "{low} to {high} dB, {found} dB found");
+        assert!(report["verdict"] != "good", "{report:#}");
+    }
+}
+
 #[tokio::test]
 async fn the_service_leaves_out_what_was_not_measured() {
     let app = TestApp::with(&["--workers", "1"]).await;
@@ -162,7 +196,20 @@ async fn the_service_leaves_out_what_was_not_measured() {
     let job = json!({"measurement": measurement["id"], "algorithm": "gap-tv",
         "tile": {"size": 48, "overlap": 16}});
     let job = app.submit(&job).await;
-    assert_eq!(app.ended(&job).await["state"], "succeeded");
+    let ended = app.ended(&job).await;
+    assert_eq!(ended["state"], "succeeded");
+    // The empty snapshot has no expected PSNR, and doesn't raise that of the job.
+    let mut stated = Vec::new();
+    for snapshot in 0..3 {
+        let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/manifest");
+        let manifest = app.get(&path).await.expect(200).json();
+        stated.push(manifest["content"]["assessment"]["psnr_db"].clone());
+    }
+    let mean = (stated[0].as_f64().unwrap() + stated[2].as_f64().unwrap()) / 2.0;
+    assert_eq!(stated[1], Value::Null);
+    let whole_job = ended["assessment"]["psnr_db"].as_f64().unwrap();
+    assert!((whole_job - mean).abs() < 0.11, "{stated:?}: {whole_job} dB");
+    assert_eq!(ended["verdict"], "usable");
     for snapshot in 0..3 {
         let path = format!("/v1/jobs/{job}/snapshots/{snapshot}/exports/npy");
         let frames = values(&app.get(&path).await.expect(200).bytes);

@@ -68,8 +68,10 @@ pub enum FormatError {
         "the samples are {0}, which has no default full scale: state `full_scale`, the stored value that means 1"
     )]
     FullScaleNeeded(String),
-    /// The full scale is not a finite positive number.
-    #[error("full_scale is {0}; it must be a finite number above 0")]
+    /// The full scale is not a positive number that 32-bit floats have.
+    #[error(
+        "full_scale is {0:?} as a 32-bit float; it must be a finite number of at least 1.2e-38"
+    )]
     FullScale(f32),
     /// A value is NaN or infinite.
     #[error(
@@ -94,7 +96,8 @@ pub enum FormatError {
     /// All masks are closed everywhere.
     #[error(
         "masks: the largest value of all {frames} frames is {largest:?}, less than a millionth of the full scale \
-         {full_scale:?}; masks need open pixels: state as `full_scale` the stored value of an open pixel"
+         {full_scale:?}; masks need open pixels: state as `full_scale` the stored value of an open pixel, and check the NaN \
+         of the masks and the map of bad pixels, which are not measured"
     )]
     AllMasksZero { frames: usize, largest: f32, full_scale: f32 },
     /// One mask is closed everywhere.
@@ -103,10 +106,10 @@ pub enum FormatError {
          {full_scale:?}; every mask needs open pixels"
     )]
     MaskFrameZero { frame: usize, frames: usize, full_scale: f32 },
-    /// A value can't be represented after the division by the full scale.
+    /// A value is implausibly far above the full scale.
     #[error(
-        "measurement: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value}, which can't be \
-         represented after the division by the full scale {full_scale}: state as `full_scale` the stored value that means 1"
+        "measurement: the value at frame {frame}, row {row}, column {column} (counted from 0) is {value:?}, which is more \
+         than 1e15 times the full scale {full_scale:?}: state as `full_scale` the stored value that means 1"
     )]
     Overflow { value: f32, frame: usize, row: usize, column: usize, full_scale: f32 },
     /// No snapshot has light.
@@ -125,10 +128,8 @@ pub enum Lightless {
     /// All values are NaN.
     #[strum(to_string = "has no finite value: all pixels are NaN, or left out for their masks")]
     NotMeasured,
-    /// All values become 0.
-    #[strum(
-        to_string = "is zero everywhere after the division by the full scale, which is too large"
-    )]
+    /// All values are tiny.
+    #[strum(to_string = "has no value above a 1e15th of the full scale, which is too large")]
     Underflow,
 }
 

@@ -13,6 +13,11 @@ const TOLERANCE: f32 = 1e-6;
 /// values, on which the projection divides, would leave the range of 32-bit floats.
 pub const MIN_OPEN: f32 = 1e-6;
 
+/// Smallest and largest size of a measured value relative to the full scale. No camera is beyond, and sums of squares of such
+/// values stay within the range of 32-bit floats.
+const MIN_LIGHT: f32 = 1e-15;
+const MAX_LIGHT: f32 = 1e15;
+
 /// Statistics of masks on `[0,1]`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MaskStatistics {
@@ -176,7 +181,8 @@ impl Side {
 }
 
 /// Reads all snapshots, and passes each one (row, column) divided by the full scale to `sink`. Values may have any
-/// sign; NaN are not measured and stay NaN. Returns the snapshots without light.
+/// sign; NaN are not measured and stay NaN. Values below a 1e15th of the full scale become 0. Returns the snapshots without
+/// light.
 ///
 /// Errors: those of the reader and of the sink; [`FormatError::NotFinite`]; [`FormatError::Overflow`];
 /// [`FormatError::NoLight`] if no snapshot has light. After an error the output of the sink is invalid.
@@ -196,10 +202,11 @@ pub fn check_snapshots(
             if value.is_infinite() {
                 return Err(not_finite("measurement", *value, snapshots, row, column));
             }
-            if scaled.is_infinite() {
+            if scaled.abs() > MAX_LIGHT {
                 let (value, frame, full_scale) = (*value, snapshots, scale);
                 return Err(FormatError::Overflow { value, frame, row, column, full_scale });
             }
+            let scaled = if scaled.abs() < MIN_LIGHT { 0.0 } else { scaled };
             has_light |= scaled != 0.0 && !scaled.is_nan();
             state = match state {
                 _ if value.is_nan() => state,

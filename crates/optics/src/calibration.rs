@@ -63,7 +63,8 @@ impl Repeats {
 
     /// Adds a capture \[H,W\].
     ///
-    /// Errors: [`OpticsError::Captures`] for another size, and for values that are not finite or above 1e15.
+    /// Errors: [`OpticsError::Captures`] for another size, and for values that are not finite or above 1e15. Pixels
+    /// that are left out may have any value.
     pub fn add(&mut self, capture: ArrayView2<'_, f32>) -> Result<()> {
         if capture.dim() != self.sum.dim() {
             let ((a, b), (c, d)) = (capture.dim(), self.sum.dim());
@@ -73,7 +74,10 @@ impl Repeats {
             )));
         }
         let is_usable = |value: &f32| value.abs() <= *RANGE.end();
-        if let Some(((row, column), value)) = capture.indexed_iter().find(|(_, v)| !is_usable(v)) {
+        let is_refused = |&(place, value): &((usize, usize), &f32)| {
+            !is_usable(value) && !self.sum[place].is_nan()
+        };
+        if let Some(((row, column), value)) = capture.indexed_iter().find(is_refused) {
             let limit = RANGE.end();
             return Err(OpticsError::Captures(format!(
                 "{value:?} at row {row}, column {column} (counted from 0); every value must be finite and at most \

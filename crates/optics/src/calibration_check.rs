@@ -281,6 +281,9 @@ fn swapped_order(figures: &MaskFigures, patterns: Option<ArrayView3<'_, f32>>) -
     Some(Finding::new(FindingCode::SwappedOrder, detail).with_frames(frames))
 }
 
+/// Largest mean brightness of a pattern relative to the white image.
+const MAX_PATTERN_LIGHT: f64 = 1.5;
+
 /// Checks the captures of a calibration.
 pub fn judge_captures(figures: &CaptureFigures) -> Vec<Finding> {
     let mut findings = saturation(figures);
@@ -294,6 +297,14 @@ pub fn judge_captures(figures: &CaptureFigures) -> Vec<Finding> {
             figures.denominator_too_dark * 100.0
         );
         findings.push(Finding::new(FindingCode::DarkIllumination, detail).escalate_if(lost > 0.05));
+    }
+    let brightest = figures.patterns.iter().map(|pattern| pattern.light).fold(0.0, f64::max);
+    if brightest > MAX_PATTERN_LIGHT {
+        let detail = format!(
+            "a pattern is {brightest:.1} times as bright as the white image, which has all patterns' light: the exposures \
+             differ, or white and black are interchanged"
+        );
+        findings.push(Finding::new(FindingCode::DarkIllumination, detail));
     }
     findings.extend(wrong_dark(figures));
     if let Some(flatness) = figures.illumination_flatness.filter(|flatness| *flatness < 0.5) {

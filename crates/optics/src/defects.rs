@@ -1,5 +1,7 @@
 //! Pixels of a snapshot that carry no information on the scene: saturated ones, and outliers.
 
+use std::ops::Range;
+
 use ndarray::{Array2, ArrayView2};
 
 use super::{Finding, FindingCode};
@@ -182,6 +184,83 @@ fn dead_lines(
     rows.flat_map(|row| (0..width).map(move |column| (row, column))).collect()
 }
 
+/// A run of equal values is frozen if the light of the masks changes this often within it, each time by this share. Behind
+/// masks of random pixels equal values of a scene end after a few changes.
+const FROZEN_CHANGES: usize = 8;
+const LIGHT_CHANGE: f32 = 0.02;
+
+/// Pixels of frozen parts of the sensor: runs along rows or columns with one value, well above the darkest, although the
+/// masks let different light through. `values` \[H,W\] are as stored, NaN where nothing was measured; `light` \[H,W\] is the
+/// sum of the masks.
+///
+/// Integers that are coarser than the changes of the light may be equal by chance, so they are not compared.
+fn frozen(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<(usize, usize)> {
+    let finite = || values.iter().copied().filter(|value| value.is_finite());
+    let (low, high) = limits(finite());
+    let mut runs = runs(values, light);
+    let down = self::runs(values.t(), light.t()).into_iter();
+    let mut all: Vec<_> = runs.drain(..).map(|run| (run, false)).collect();
+    all.extend(down.map(|run| (run, true)));
+    all.retain(|(run, _)| run.value > low + MIN_EXCESS * (high - low));
+    if all.is_empty() {
+        return Vec::new();
+    }
+    let mut steps: Vec<f32> = finite().collect();
+    steps.sort_unstable_by(f32::total_cmp);
+    steps.dedup();
+    // Distance to the next value that the snapshot has.
+    let step = |value: f32| {
+        let at = steps.partition_point(|other| *other < value);
+        let next = [at.checked_sub(1), Some(at + 1)].into_iter().flatten();
+        let next = next.filter_map(|at| steps.get(at)).map(|other| (other - value).abs());
+        next.fold(f32::INFINITY, f32::min)
+    };
+    all.retain(|(run, _)| (run.value - low) * run.contrast > 2.0 * step(run.value));
+    let places = all.into_iter().flat_map(|(run, is_column)| {
+        run.along.map(move |at| if is_column { (at, run.line) } else { (run.line, at) })
+    });
+    let mut places: Vec<_> = places.collect();
+    places.sort_unstable();
+    places.dedup();
+    places
+}
+
+/// Equal values along a line.
+struct Run {
+    value: f32,
+    line: usize,
+    along: Range<usize>,
+    /// Standard deviation of the light in the run, relative to its mean.
+    contrast: f32,
+}
+
+/// Runs of equal values along the rows within which the light changes often.
+fn runs(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<Run> {
+    let mut runs = Vec::new();
+    for (line, (values, light)) in values.outer_iter().zip(light.outer_iter()).enumerate() {
+        let mut start = 0;
+        while start < values.len() {
+            let value = values[start];
+            let end = (start..values.len()).find(|at| values[*at] != value);
+            let along = start..end.unwrap_or(values.len()).max(start + 1);
+            start = along.end;
+            if along.len() <= FROZEN_CHANGES || !value.is_finite() {
+                continue;
+            }
+            let light = light.slice(ndarray::s![along.clone()]);
+            let mean = light.mean().unwrap_or(0.0);
+            let changes = light
+                .windows(2)
+                .into_iter()
+                .filter(|pair| (pair[1] - pair[0]).abs() > LIGHT_CHANGE * mean);
+            if mean > 0.0 && changes.count() >= FROZEN_CHANGES {
+                runs.push(Run { value, line, along, contrast: light.std(0.0) / mean });
+            }
+        }
+    }
+    runs
+}
+
 /// Inserts a value into a list in order and drops the last one.
 fn insert(list: &mut [f32], value: f32, before: impl Fn(f32, f32) -> bool) {
     let Some(place) = list.iter().position(|old| before(value, *old)) else { return };
@@ -196,6 +275,10 @@ pub struct Defects {
     pub missing: usize,
     /// Number of outliers.
     pub outliers: usize,
+    /// Number of pixels in frozen parts of the sensor.
+    pub frozen: usize,
+    /// Number of pixels in areas without a measured pixel.
+    pub unmeasured: usize,
     /// Number of saturated pixels.
     pub saturated: usize,
     /// Value from which on pixels are saturated.
@@ -204,12 +287,17 @@ pub struct Defects {
     pub is_binary: bool,
 }
 
+/// The smallest and the largest of the values.
+fn limits(values: impl Iterator<Item = f32>) -> (f32, f32) {
+    values.fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
+        (low.min(value), high.max(value))
+    })
+}
+
 /// True if there are exactly two values apart from NaN.
 fn is_binary(values: &Array2<f32>) -> bool {
     let finite = || values.iter().copied().filter(|value| value.is_finite());
-    let (low, high) = finite().fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), value| {
-        (low.min(value), high.max(value))
-    });
+    let (low, high) = limits(finite());
     low < high && finite().all(|value| value == low || value == high)
 }
 
@@ -239,23 +327,42 @@ impl Defects {
             values[place] = f32::NAN;
             found.outliers += 1;
         }
-        found.level = saturation(values.view(), light, stated);
-        if let Some(level) = found.level {
-            found.saturated = values.iter().filter(|value| **value >= level).count();
+        found.mark_saturated(values, light, stated);
+        for place in frozen(values.view(), light) {
+            values[place] = f32::NAN;
+            found.frozen += 1;
+        }
+        let areas = values.exact_chunks((AREA, AREA)).into_iter();
+        let unmeasured = areas.filter(|area| area.iter().all(|value| value.is_nan()));
+        found.unmeasured = AREA * AREA * unmeasured.count();
+        found
+    }
+
+    fn mark_saturated(
+        &mut self,
+        values: &mut Array2<f32>,
+        light: ArrayView2<'_, f32>,
+        stated: Option<f32>,
+    ) {
+        self.level = saturation(values.view(), light, stated);
+        if let Some(level) = self.level {
+            self.saturated = values.iter().filter(|value| **value >= level).count();
             // Without nearly all pixels there is nothing to reconstruct from.
-            if found.saturated * 10 <= values.len() * 9 {
+            if self.saturated * 10 <= values.len() * 9 {
                 values.mapv_inplace(|value| if value >= level { f32::NAN } else { value });
             }
         }
-        found
     }
 }
 
 /// Share of saturated pixels, and of outliers, from which there is a finding, and from which frames are wrong.
 const REPORTED_SHARE: f64 = 0.001;
 const GRAVE_SHARE: f64 = 0.2;
-/// Share of pixels marked as not measured from which frames are wrong: little is left to measure.
-const MAX_MISSING: f64 = 0.75;
+/// Share of pixels marked as not measured above which frames are wrong. The expected PSNR was compared with the true one up
+/// to this share.
+const MAX_MISSING: f64 = 0.5;
+/// Side of the areas that are searched for measured pixels.
+const AREA: usize = 16;
 
 /// Reports the defects of a snapshot of `pixels` pixels.
 #[allow(clippy::cast_precision_loss)] // counts of pixels
@@ -263,7 +370,7 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
     const LEFT_OUT: &str = "They are left out of the reconstruction";
     let share = |count: usize| count as f64 / pixels.max(1) as f64;
     let mut findings = Vec::new();
-    let Defects { missing, outliers, saturated, level, is_binary } = *defects;
+    let Defects { missing, outliers, frozen, unmeasured, saturated, level, is_binary } = *defects;
     if is_binary {
         let detail = "the snapshot has only two values, as masks have";
         findings.push(Finding::new(FindingCode::BinaryMeasurement, detail));
@@ -276,19 +383,32 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
         let finding = Finding::new(FindingCode::Saturated, detail);
         findings.push(finding.escalate_if(share(saturated) > GRAVE_SHARE));
     }
-    if missing + outliers > 0 {
+    if missing + outliers + frozen > 0 {
         let mut parts = Vec::new();
         if outliers > 0 {
             parts.push(format!(
                 "{outliers} pixels are far brighter or darker than their neighbours and their masks allow"
             ));
         }
+        if frozen > 0 {
+            parts.push(format!(
+                "{frozen} pixels have the value of their neighbours although the masks differ: that part of the sensor \
+                 or of its transfer was frozen"
+            ));
+        }
         if missing > 0 {
             parts.push(format!("{missing} pixels are marked as not measured"));
         }
-        let detail = format!("{}. {LEFT_OUT}", parts.join(", and "));
+        let mut detail = format!("{}. {LEFT_OUT}", parts.join(", and "));
+        if unmeasured > 0 {
+            let percent = 100.0 * share(unmeasured);
+            detail += &format!(
+                ". At least {percent:.1} % of the picture lies in areas without a measured pixel, where the frames are a \
+                 guess"
+            );
+        }
         // The user knows of the pixels that are marked. Frames follow the measurement where it is measured.
-        let grave = share(outliers) > GRAVE_SHARE || share(missing) > MAX_MISSING;
+        let grave = share(outliers + frozen) > GRAVE_SHARE || share(missing) > MAX_MISSING;
         findings.push(Finding::new(FindingCode::BadPixels, detail).escalate_if(grave));
     }
     findings
@@ -296,9 +416,9 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Defects, MIN_PILE_UP, outliers, saturation};
+    use super::{AREA, Defects, MIN_PILE_UP, limits, outliers, saturation};
     use crate::{iid_masks, measure, noisy, random_squares};
-    use ndarray::{Array2, Array3, Axis};
+    use ndarray::{Array2, Array3, Axis, s};
 
     /// A bright disc that moves over dark texture.
     fn scene(frames: usize) -> Array3<f32> {
@@ -372,6 +492,41 @@ mod tests {
                     );
                     assert_eq!(clipped.iter().filter(|value| value.is_nan()).count(), count);
                 }
+            }
+        }
+    }
+
+    /// A patch or a line of one value in the middle of the range is no scene behind these masks.
+    #[test]
+    fn frozen_parts_of_the_sensor_are_left_out_and_scenes_have_none() {
+        let patch = |y: &mut Array2<f32>, value| y.slice_mut(s![16..64, 32..80]).fill(value);
+        for (frames, masks) in [4, 8, 16].into_iter().flat_map(|b| all_masks(b).map(|m| (b, m))) {
+            let light = masks.sum_axis(Axis(0));
+            let y = measure(masks.view(), scene(frames).view()).unwrap();
+            let (low, high) = limits(y.iter().copied());
+            let marked = |mut y: Array2<f32>| Defects::mark(&mut y, None, light.view(), (1, None));
+            for steps in [f32::INFINITY, 4095.0, 255.0] {
+                // A camera adds a constant to black parts, too.
+                let camera = |y: &Array2<f32>| match steps {
+                    f32::INFINITY => y.clone(),
+                    _ => y.mapv(|y| (8.0 + y / high * steps).round()),
+                };
+                let black = |y: &Array2<f32>| {
+                    let mut y = y.clone();
+                    patch(&mut y, 0.0);
+                    y
+                };
+                assert_eq!(marked(camera(&y)).frozen, 0, "{frames} {steps}");
+                assert_eq!(marked(camera(&black(&y))).frozen, 0, "{frames} {steps}");
+                let mut frozen = y.clone();
+                patch(&mut frozen, (low + high) / 2.0);
+                let found = marked(camera(&frozen));
+                assert!((2304..2400).contains(&found.frozen), "{frames} {steps}: {found:?}");
+                assert_eq!(found.unmeasured, 9 * AREA * AREA);
+                let mut line = y.clone();
+                line.column_mut(50).fill(0.6 * high);
+                let found = marked(camera(&line));
+                assert!(found.frozen + found.outliers >= 96, "{frames} {steps}: {found:?}");
             }
         }
     }

@@ -146,7 +146,7 @@ findings! {
         "pixels are saturated",
         "reduce the exposure time or stop down the lens; if the value is a valid reading, state a higher `saturation`";
     BadPixels: [Measurement], [Warning, Error],
-        "pixels are hot, dead, or marked as not measured",
+        "pixels are hot, dead, frozen, or marked as not measured",
         "if there are few, do nothing; otherwise name a map of the sensor's bad pixels as `bad_pixels` of the calibration";
     EmptySnapshot: [Measurement], [Warning],
         "a snapshot is 0 everywhere, or has no finite value",

@@ -164,6 +164,39 @@ pub fn blocks(height: usize, width: usize) -> (usize, usize) {
     (height.div_ceil(BLOCK), width.div_ceil(BLOCK))
 }
 
+/// The information of a measurement on a block of a snapshot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Coverage {
+    /// Enough of its pixels were measured.
+    Measured,
+    /// All measured pixels of the whole snapshot are 0.
+    Dark,
+    /// Hardly any of its pixels was measured, so that its frames are a guess.
+    Unmeasured,
+}
+
+/// Smallest share of the pixels of a block that must be measured.
+const MIN_MEASURED: f32 = 1.0 / 16.0;
+
+/// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\]. NaN were not measured.
+pub fn coverage(y: ArrayView3<'_, f32>) -> Array3<Coverage> {
+    let (snapshots, height, width) = y.dim();
+    let (rows, columns) = blocks(height, width);
+    let mut all = Array3::from_elem((snapshots, rows, columns), Coverage::Measured);
+    for (y, mut all) in y.outer_iter().zip(all.outer_iter_mut()) {
+        let is_dark = y.iter().all(|value| value.is_nan() || *value == 0.0);
+        let measured = over_blocks(y.dim(), |i, j| if y[[i, j]].is_nan() { 0.0 } else { 1.0 });
+        all.zip_mut_with(&measured, |block, measured| {
+            *block = match () {
+                () if *measured < MIN_MEASURED => Coverage::Unmeasured,
+                () if is_dark => Coverage::Dark,
+                () => Coverage::Measured,
+            }
+        });
+    }
+    all
+}
+
 /// Features of each block \[S B, rows, columns\]; see [`Features::of`].
 pub fn block_features(
     op: &SensingOperator,

@@ -39,6 +39,8 @@ const ENDINGS: [&str; 10] = ["npy", "npz", "tif", "tiff", "png", "zip", "tar", "
 const PACKED_ENDINGS: [&str; 2] = ["raw", "bin"];
 /// File with verdict and findings, in the folder of the results.
 const REPORT: &str = "REPORT.txt";
+/// Longest name of a file in bytes. File systems allow 255, and names of results are longer than that of the file.
+const MAX_NAME: usize = 230;
 /// Time between two scans of the folder.
 const POLL: Duration = Duration::from_millis(500);
 
@@ -49,8 +51,8 @@ const POLL: Duration = Duration::from_millis(500);
 /// time. With --once it ends with 1 if a job failed or a file was skipped, and with 3 if the verdict on a file is bad.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// The folder. Subfolders and hidden files are ignored. Links, empty files and names that are not UTF-8 are skipped and
-    /// reported.
+    /// The folder. Subfolders and hidden files are ignored. Links, empty files, and names that are not UTF-8, have control
+    /// characters or more than 230 bytes are skipped and reported.
     folder: PathBuf,
     #[command(flatten)]
     service: ServiceArguments,
@@ -209,6 +211,8 @@ impl Watch<'_> {
 
     /// Prints once why a file is not submitted.
     fn report_skipped(&self, name: &str, reason: &str) -> Result<()> {
+        // A terminal would obey control characters.
+        let name = name.replace(char::is_control, "\u{fffd}");
         if self.arguments.json {
             let step = json!({"state": "skipped", "reason": reason});
             return print_line(json!({"file": name, "step": step}));
@@ -405,6 +409,14 @@ impl Watch<'_> {
         let Some(name) = name.to_str() else {
             return Some(Err("the name is not UTF-8; rename the file"));
         };
+        if name.chars().any(char::is_control) {
+            return Some(Err("the name has control characters; rename the file"));
+        }
+        if name.len() > MAX_NAME {
+            return Some(Err(
+                "the name has more than 230 bytes, so that results can't be named after it; rename the file",
+            ));
+        }
         let time = (meta.mtime(), meta.mtime_nsec());
         Some(Ok(Shot { name: name.to_owned(), size: meta.len(), time }))
     }

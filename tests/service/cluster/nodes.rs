@@ -363,18 +363,38 @@ impl Nats {
     }
 }
 
+/// A copy of a file in a folder that other users may read; the clone may lie where they can't. The next run of the tests
+/// replaces it.
+fn readable_copy(file: &Path) -> PathBuf {
+    let user = rustix::process::getuid().as_raw();
+    let folder = std::env::temp_dir().join(format!("sci-recon-tests-{user}"));
+    std::fs::create_dir_all(&folder).unwrap();
+    let open = |path: &Path| {
+        std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o755)).unwrap();
+    };
+    open(&folder);
+    let draft = tempfile::NamedTempFile::new_in(&folder).unwrap();
+    std::fs::copy(file, draft.path()).unwrap();
+    open(draft.path());
+    let path = folder.join(file.file_name().unwrap());
+    draft.persist(&path).unwrap();
+    path
+}
+
 /// A copy of the program that other users may run.
 pub fn program() -> &'static Path {
-    static COPY: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
-    let (_, path) = COPY.get_or_init(|| {
-        let folder = tempfile::tempdir().unwrap();
-        let open = std::fs::Permissions::from_mode(0o755);
-        std::fs::set_permissions(folder.path(), open).unwrap();
-        let path = folder.path().join("sci-recon");
-        std::fs::copy(env!("CARGO_BIN_EXE_sci-recon"), &path).unwrap();
-        (folder, path)
-    });
-    path
+    static COPY: OnceLock<PathBuf> = OnceLock::new();
+    COPY.get_or_init(|| readable_copy(Path::new(env!("CARGO_BIN_EXE_sci-recon"))))
+}
+
+/// A copy of libonnxruntime that other users may read, if it is installed.
+pub fn library() -> Option<&'static Path> {
+    static COPY: OnceLock<Option<PathBuf>> = OnceLock::new();
+    let copy = || {
+        let library = PathBuf::from(std::env::var_os("ORT_DYLIB_PATH")?);
+        library.is_file().then(|| readable_copy(&library))
+    };
+    COPY.get_or_init(copy).as_deref()
 }
 
 /// A user without rights to any file.
@@ -443,9 +463,7 @@ impl RemoteWorker {
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(file);
-        if let Ok(library) = std::env::var("ORT_DYLIB_PATH") {
-            command.env("ORT_DYLIB_PATH", library);
-        }
+        command.envs(library().map(|library| ("ORT_DYLIB_PATH", library)));
         if rustix::process::getuid().is_root() {
             std::os::unix::fs::chown(folder.path(), Some(UNPRIVILEGED_UID), Some(UNPRIVILEGED_UID))
                 .unwrap();

@@ -24,6 +24,8 @@ ENDINGS = {".npy", ".npz", ".tif", ".tiff", ".png", ".zip", ".tar", ".mat", ".h5
 # Further endings of packed pixels without a header.
 PACKED_ENDINGS = {".raw", ".bin"}
 LEDGER = ".sci-recon-watch.json"
+# Longest name of a file in bytes. File systems allow 255, and names of results are longer than that of the file.
+MAX_NAME = 230
 # The ledger of `sci-recon watch-folder`.
 OTHER_LEDGER = ".sci-recon.ledger"
 ENDED = {"succeeded", "failed", "cancelled"}
@@ -67,6 +69,8 @@ class Watch:
         ledger = self.folder / LEDGER
         self.done: dict[str, str] = json.loads(ledger.read_text("utf-8")) if ledger.exists() else {}
         self.jobs: dict[str, tuple[Path, Job]] = {}
+        # Names of skipped files that were reported.
+        self.skipped: set[str] = set()
         # Files that may still change, with the time at which they were first listed.
         self.settling: dict[str, float] = {}
 
@@ -121,6 +125,11 @@ class Watch:
             or not path.is_file()
         ):
             return None
+        if len(path.name.encode("utf-8", "surrogateescape")) > MAX_NAME:
+            if path.name not in self.skipped:
+                self.skipped.add(path.name)
+                print(f"{path.name} is skipped: the name has more than {MAX_NAME} bytes; rename the file", flush=True)
+            return None
         try:
             meta = path.stat()
         except FileNotFoundError:
@@ -135,7 +144,7 @@ class Watch:
             self._fail(key, path, JobFailed(job.record))
             return
         # The folder is renamed once it is complete.
-        draft = path.with_name(f".{path.name}.{job.id}.part")
+        draft = path.with_name(f".{job.id}.part")
         result = Result(job, draft)
         for snapshot in result.snapshots:
             for name in self.files:

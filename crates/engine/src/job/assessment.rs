@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::report::{Finding, Grade};
+use super::report::{Finding, FindingCode, Grade};
 
 /// The predicted quality of the frames of a snapshot or a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -46,13 +46,39 @@ impl Assessment {
     /// Frames are graded bad if the upper end of the interval is below this PSNR in dB.
     pub const BAD_DB: f64 = 22.0;
 
-    /// The assessment of a job: the means over its snapshots, and the worst grade. `None` if a snapshot has none. A PSNR is
-    /// `None` if that of a snapshot is.
+    /// The assessment of a snapshot without light, whose frames are black or a guess.
+    pub fn empty(warnings: &[Finding]) -> Self {
+        let mut reasons = warnings.to_vec();
+        if !reasons.iter().any(|reason| reason.is(FindingCode::EmptySnapshot)) {
+            let title = FindingCode::EmptySnapshot.entry().title;
+            reasons.push(Finding::new(FindingCode::EmptySnapshot, title));
+        }
+        Self {
+            grade: Grade::Bad,
+            psnr_db: None,
+            psnr_low_db: None,
+            psnr_high_db: None,
+            order: None,
+            order_reason: None,
+            reasons,
+        }
+    }
+
+    /// True for a snapshot without light.
+    pub fn is_empty(&self) -> bool {
+        self.psnr_db.is_none() && self.reasons.iter().any(|one| one.is(FindingCode::EmptySnapshot))
+    }
+
+    /// The assessment of a job: the means over its snapshots that have light, and their worst grade; at best `usable` if
+    /// some have none. `None` if a snapshot has no assessment. A PSNR is `None` if that of a snapshot is.
     pub fn combined<'a>(snapshots: impl Iterator<Item = Option<&'a Self>>) -> Option<Self> {
         let all = snapshots.collect::<Option<Vec<_>>>().filter(|all| !all.is_empty())?;
+        let lit: Vec<_> = all.iter().copied().filter(|one| !one.is_empty()).collect();
+        let judged = if lit.is_empty() { &all } else { &lit };
+        let best = if lit.len() < all.len() { Grade::Usable } else { Grade::Good };
         let mean = |value: fn(&Self) -> Option<f64>| {
-            let sum = all.iter().map(|one| value(one)).sum::<Option<f64>>();
-            sum.map(|sum| Self::round(sum / all.len() as f64))
+            let sum = judged.iter().map(|one| value(one)).sum::<Option<f64>>();
+            sum.map(|sum| Self::round(sum / judged.len() as f64))
         };
         let mut reasons: Vec<Finding> = Vec::new();
         for reason in all.iter().flat_map(|one| &one.reasons) {
@@ -62,7 +88,7 @@ impl Assessment {
         }
         let order = all.iter().filter_map(|one| one.order).max();
         Some(Self {
-            grade: all.iter().map(|one| one.grade).max()?,
+            grade: judged.iter().map(|one| one.grade).max()?.max(best),
             psnr_db: mean(|one| one.psnr_db),
             psnr_low_db: mean(|one| one.psnr_low_db),
             psnr_high_db: mean(|one| one.psnr_high_db),

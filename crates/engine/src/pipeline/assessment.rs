@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, withholds_quality};
 pub use reconstruction::assessment::{BLOCK, blocks};
-use reconstruction::assessment::{Evidence, unfamiliar_masks};
+use reconstruction::assessment::{Coverage, Evidence, unfamiliar_masks};
 use reconstruction::hold_out::Prediction;
 use reconstruction::motion::fastest;
 use reconstruction::order::Order;
@@ -43,6 +43,10 @@ pub struct TileAssessment {
 const LEVELS_PER_DB: f32 = 4.0;
 /// The level of blocks without light, which have no error.
 const DARK: u8 = u8::MAX;
+/// The level of blocks that were not measured.
+const UNMEASURED: u8 = u8::MAX - 1;
+/// Expected PSNR of blocks that were not measured, in dB. Half a picture that the priors fill has 6 dB, a tenth 8 to 12 dB.
+const UNMEASURED_DB: f64 = 10.0;
 
 impl TileAssessment {
     /// Assesses a tile from the schedule that solved it, the pilot's evidence, and the white level of the scene. `None`
@@ -58,13 +62,25 @@ impl TileAssessment {
         let unfamiliar = outcome.features.iter().any(|piece| unfamiliar_masks(&piece.blocks));
         let offset = if unfamiliar { model.misses.unfamiliar.offset } else { 0.0 };
         let level = |error: &f32| {
-            ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, 254.0) as u8
+            ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, f32::from(UNMEASURED - 1))
+                as u8
         };
         let mut levels = vec![DARK; frames * rows * columns];
         for piece in &outcome.features {
             let errors = model.log_errors(piece, evidence);
             let levels = levels.iter_mut().skip(piece.first_frame * rows * columns);
             levels.zip(&errors).for_each(|(place, error)| *place = level(error));
+        }
+        let ratio = frames / outcome.coverage.dim().0.max(1);
+        for ((snapshot, row, column), coverage) in outcome.coverage.indexed_iter() {
+            let level = match coverage {
+                Coverage::Measured => continue,
+                Coverage::Dark => DARK,
+                Coverage::Unmeasured => UNMEASURED,
+            };
+            for k in snapshot * ratio..(snapshot + 1) * ratio {
+                levels[(k * rows + row) * columns + column] = level;
+            }
         }
         // The estimate of frames that are mostly wrong is unbounded, and the server refuses impossible records.
         let motion = fastest(outcome.frames.view(), white).max(0.0).min((height + width) as f32);
@@ -91,15 +107,24 @@ impl TileAssessment {
             && self.levels.iter().zip(&other.levels).all(is_close)
     }
 
-    fn is_dark(&self) -> bool {
-        self.levels.iter().all(|level| *level == DARK)
+    /// True if light was measured of a frame.
+    fn is_lit(&self, frame: usize) -> bool {
+        let blocks = self.size.0 * self.size.1;
+        self.levels.iter().skip(frame * blocks).take(blocks).any(|level| *level < UNMEASURED)
+    }
+
+    fn level(&self, frame: usize, row: usize, column: usize) -> u8 {
+        let (rows, columns) = self.size;
+        self.levels.get((frame * rows + row) * columns + column).copied().unwrap_or(DARK)
     }
 
     /// Expected squared error of a block, on the unit scale of the solver.
     fn error(&self, frame: usize, row: usize, column: usize) -> f64 {
-        let (rows, columns) = self.size;
-        let level = self.levels.get((frame * rows + row) * columns + column);
-        10f64.powf(-f64::from(*level.unwrap_or(&DARK)) / f64::from(10.0 * LEVELS_PER_DB))
+        let decibels = match self.level(frame, row, column) {
+            UNMEASURED => UNMEASURED_DB,
+            level => f64::from(level) / f64::from(LEVELS_PER_DB),
+        };
+        10f64.powf(-decibels / 10.0)
     }
 }
 
@@ -113,8 +138,8 @@ pub struct Expected {
 
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
 /// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
-/// of the PSNR. With `spectral` frames are bands, which neither move nor have an order in time. `None` if a tile has none, or
-/// if no tile has light.
+/// of the PSNR. With `spectral` frames are bands, which neither move nor have an order in time. A snapshot without light gets
+/// no figures. `None` if a tile has none.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
@@ -126,13 +151,14 @@ pub fn expected(
     let (height, width) = plan.dim();
     let (rows, columns) = blocks(height, width);
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
+    let mut unmeasured = squares.clone();
     let block_centre = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
     let (mut lit, mut motion, mut unfamiliar) = (false, 0.0f32, false);
     let (mut predictions, mut orders) = (Vec::new(), Vec::new());
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
-            lit |= !assessed.is_dark();
+            lit |= (0..frames).any(|k| assessed.is_lit(share.frame(k)));
             if !spectral {
                 motion = motion.max(assessed.motion);
                 orders.extend(assessed.order);
@@ -152,29 +178,36 @@ pub fn expected(
                     let Some(j) = at else { continue };
                     for k in 0..frames {
                         let weight = f64::from(share.weights[k] * weights[[i, j]]);
-                        let error = assessed.error(share.frame(k), i / BLOCK, j / BLOCK);
-                        squares[[k, row, column]] += weight * error;
+                        let block = (share.frame(k), i / BLOCK, j / BLOCK);
+                        squares[[k, row, column]] +=
+                            weight * assessed.error(block.0, block.1, block.2);
+                        if assessed.level(block.0, block.1, block.2) == UNMEASURED {
+                            unmeasured[[k, row, column]] += weight;
+                        }
                     }
                 }
             }
         }
     }
-    if !lit {
-        return None;
-    }
     // Errors are on the unit scale of the solver.
     let (unit, peak) = (f64::from(normalisation), f64::from(white_level));
+    if !lit {
+        let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
+        return Some(Expected { assessment: Assessment::empty(warnings), error });
+    }
     let psnr = |frame: ndarray::ArrayView2<'_, f64>| {
         -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * (unit / peak).powi(2)).log10()
     };
     let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
     let bound = |offset: f64| (psnr_db + offset).min(Assessment::MAX_PSNR_DB);
     let misses = &model.misses;
-    let interval = if unfamiliar { misses.unfamiliar.interval } else { misses.interval };
+    let is_guess = unmeasured.mean() > Some(MAX_UNMEASURED);
+    let interval =
+        if unfamiliar || is_guess { misses.unfamiliar.interval } else { misses.interval };
     let [low, high] = interval.map(bound);
     let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
     let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);
-    let mut reasons = reasons(&error, (psnr_db, peak), warnings);
+    let mut reasons = reasons((&error, &unmeasured), (psnr_db, peak), warnings);
     reasons.extend(unexplained_pixels(&predictions));
     reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
@@ -273,11 +306,18 @@ fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
     if is_limited { expected.max(Grade::Usable) } else { expected }
 }
 
+/// Share of the picture that was not measured from which the expected PSNR is as uncertain as behind unfamiliar masks.
+const MAX_UNMEASURED: f64 = 0.01;
 /// A part of the picture is reported if its PSNR is this much below that of the whole picture, in dB.
 const UNEVEN_DB: f64 = 4.0;
 
-/// The findings of the checks, and the worst part of the picture. `peak` is the peak of the PSNR.
-fn reasons(error: &Array3<f32>, (psnr_db, peak): (f64, f64), warnings: &[Finding]) -> Vec<Finding> {
+/// The findings of the checks, and the worst part of the picture, from the error and the unmeasured share of each block.
+/// `peak` is the peak of the PSNR.
+fn reasons(
+    (error, unmeasured): (&Array3<f32>, &Array3<f64>),
+    (psnr_db, peak): (f64, f64),
+    warnings: &[Finding],
+) -> Vec<Finding> {
     let mut reasons = warnings.to_vec();
     let (_, rows, columns) = error.dim();
     if rows < 3 || columns < 3 {
@@ -286,21 +326,27 @@ fn reasons(error: &Array3<f32>, (psnr_db, peak): (f64, f64), warnings: &[Finding
     let thirds = |length: usize| {
         [0..length / 3, length / 3..length - length / 3, length - length / 3..length]
     };
-    let (mut worst_db, mut worst_part) = (f64::INFINITY, "");
+    let (mut worst_db, mut worst_part, mut share) = (f64::INFINITY, "", 0.0);
     for (part_rows, names) in thirds(rows).into_iter().zip(PARTS) {
         for (part_columns, name) in thirds(columns).into_iter().zip(names) {
-            let part = error.slice(ndarray::s![.., part_rows.clone(), part_columns]);
+            let place = ndarray::s![.., part_rows.clone(), part_columns];
+            let part = error.slice(place);
             let mean = part.iter().map(|e| f64::from(*e).powi(2)).sum::<f64>() / part.len() as f64;
             let decibels = -10.0 * (mean / peak.powi(2)).max(1e-12).log10();
             if decibels < worst_db {
                 (worst_db, worst_part) = (decibels, name);
+                share = unmeasured.slice(place).mean().unwrap_or(0.0);
             }
         }
     }
     if worst_db < psnr_db - UNEVEN_DB {
+        let cause = match share > MAX_UNMEASURED {
+            true => format!("{:.0} % of this part were not measured", 100.0 * share),
+            false => "the masks do not resolve fine texture or fast motion there".into(),
+        };
         let detail = format!(
             "{worst_part} of the picture has an expected PSNR of {worst_db:.0} dB, the whole picture one of \
-             {psnr_db:.0} dB: the masks do not resolve fine texture or fast motion there"
+             {psnr_db:.0} dB: {cause}"
         );
         reasons.push(Finding::new(FindingCode::UnevenError, detail));
     }
@@ -336,7 +382,9 @@ const PARTS: [[&str; 3]; 3] = [
 
 #[cfg(test)]
 mod tests {
-    use super::{DARK, Prediction, TileAssessment, expected, grade, unverifiable_order};
+    use super::{
+        DARK, Prediction, TileAssessment, UNMEASURED, expected, grade, unverifiable_order,
+    };
     use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
     use reconstruction::order::Order;
     use reconstruction::schedule::Schedule;
@@ -474,13 +522,26 @@ mod tests {
         let mut incomplete = tiles([25; 4]);
         incomplete[2] = None;
         assert!(assess(incomplete).is_none());
-        // Tiles without light do not contribute.
-        let dark = TileAssessment { levels: vec![DARK; 8], motion: 0.0, ..tile(0) };
-        assert!(assess(vec![Some(dark.clone()); 4]).is_none());
+        // Tiles without light do not contribute, and no figure is stated of a snapshot without light.
+        let all = |level| Some(TileAssessment { levels: vec![level; 8], motion: 0.0, ..tile(0) });
+        for level in [DARK, UNMEASURED] {
+            let empty = assess(vec![all(level); 4]).unwrap().assessment;
+            assert_eq!((empty.grade, empty.psnr_db), (Grade::Bad, None));
+            assert!(empty.is_empty(), "{empty:?}");
+        }
         let mut lit = tiles([25; 4]);
-        lit[3] = Some(dark);
+        lit[3] = all(DARK);
         let lit = assess(lit).unwrap();
         assert!(lit.error[[0, 2, 2]] < 0.1 * lit.error[[0, 0, 0]]);
+        // Tiles that were not measured lower the figure, and widen its interval.
+        let mut partial = tiles([35; 4]);
+        partial[3] = all(UNMEASURED);
+        let partial = assess(partial).unwrap().assessment;
+        assert!(partial.psnr_db < Some(26.0) && !partial.is_empty(), "{partial:?}");
+        assert!(
+            partial.psnr_db.zip(partial.psnr_low_db).is_some_and(|(psnr, low)| psnr - low > 5.0)
+        );
+        assert!(partial.reasons[0].detail.ends_with("% of this part were not measured"));
     }
 
     #[test]
@@ -502,6 +563,14 @@ mod tests {
         let job = Assessment::combined([Some(&withheld), Some(&all[1])].into_iter()).unwrap();
         assert_eq!((job.psnr_db, job.psnr_low_db), (None, Some(22.0)));
         assert_eq!(Assessment::combined([Some(&all[0]), None].into_iter()), None);
+        // A snapshot without light has no figures, and those of the others stay.
+        let empty = Assessment::empty(&[]);
+        let good = one(30.0, Grade::Good, &[]);
+        let job = Assessment::combined([Some(&good), Some(&empty)].into_iter()).unwrap();
+        assert_eq!((job.grade, job.psnr_db), (Grade::Usable, Some(30.0)));
+        assert_eq!(job.reasons[0].code, "empty_snapshot");
+        let job = Assessment::combined([Some(&empty), Some(&empty)].into_iter()).unwrap();
+        assert_eq!((job.grade, job.psnr_db), (Grade::Bad, None));
         assert_eq!(Assessment::combined(std::iter::empty()), None);
     }
 }

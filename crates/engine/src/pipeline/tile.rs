@@ -6,7 +6,7 @@ use ndarray::{Array3, ArrayView3, Axis, s};
 
 use super::residual::residual;
 use reconstruction::ReconError;
-use reconstruction::assessment::Features;
+use reconstruction::assessment::{Features, coverage};
 use reconstruction::error::{check_parameter, check_shape};
 use reconstruction::evidence;
 use reconstruction::learned::SnapshotNetwork;
@@ -78,6 +78,7 @@ impl TileInput {
             stop_reason: StopReason::Converged,
             features: Vec::new(),
             evidence: None,
+            coverage: coverage(measured.view()),
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(combined) };
         let total: usize = pieces.iter().map(Range::len).sum();
@@ -157,6 +158,7 @@ pub fn run_network(
         Ok(Outcome {
             features: Vec::new(),
             evidence: None,
+            coverage: coverage(y),
             // Networks know no missing pixels.
             frames: network.frames(filled(y.index_axis(Axis(0), 0)).view(), op.masks())?,
             iterations: 0,

@@ -150,7 +150,9 @@ fn measurements_without_light_and_infinities_are_refused() {
     for (stack, full_scale, words) in [
         (array![[[f32::NAN, f32::NAN]]], 1.0, &["snapshot 0 of 1", "no finite value"][..]),
         (array![[[1e-30, f32::NAN]]], 1e30, &["full scale", "too large"]),
-        (array![[[0.5, 8.0]]], 1.2e-38, &["column 1", "8", "can't be represented", "full_scale"]),
+        (array![[[1e-16, f32::NAN]]], 1.0, &["full scale", "too large"]),
+        (array![[[0.5, 8.0]]], 1.2e-38, &["column 0", "0.5", "more than 1e15 times", "full_scale"]),
+        (array![[[0.5, 1e37]]], 1.0, &["column 1", "1e37", "more than 1e15 times", "full_scale"]),
     ] {
         let error = measurement(stack, full_scale).unwrap_err();
         assert!(error.is_callers_fault());
