@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView1, ArrayView2};
 
 use super::{Finding, FindingCode};
 
@@ -197,10 +197,9 @@ const LIGHT_CHANGE: f32 = 0.02;
 fn frozen(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<(usize, usize)> {
     let finite = || values.iter().copied().filter(|value| value.is_finite());
     let (low, high) = limits(finite());
-    let mut runs = runs(values, light);
-    let down = self::runs(values.t(), light.t()).into_iter();
-    let mut all: Vec<_> = runs.drain(..).map(|run| (run, false)).collect();
-    all.extend(down.map(|run| (run, true)));
+    let rows = runs_of_rows(values, light).into_iter().map(|run| (run, false));
+    let columns = runs_of_columns(values, light).into_iter().map(|run| (run, true));
+    let mut all: Vec<_> = rows.chain(columns).collect();
     all.retain(|(run, _)| run.value > low + MIN_EXCESS * (high - low));
     if all.is_empty() {
         return Vec::new();
@@ -234,27 +233,52 @@ struct Run {
     contrast: f32,
 }
 
-/// Runs of equal values along the rows within which the light changes often.
-fn runs(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<Run> {
+impl Run {
+    /// The run along a line of values and light; `None` if it is short, or the light changes too seldom in it.
+    fn new(
+        (values, light): (ArrayView1<'_, f32>, ArrayView1<'_, f32>),
+        (line, along): (usize, Range<usize>),
+    ) -> Option<Self> {
+        let value = values[along.start];
+        if along.len() <= FROZEN_CHANGES || !value.is_finite() {
+            return None;
+        }
+        let light = light.slice(ndarray::s![along.clone()]);
+        let mean = light.mean().unwrap_or(0.0);
+        let changes = light.windows(2).into_iter();
+        let changes = changes.filter(|pair| (pair[1] - pair[0]).abs() > LIGHT_CHANGE * mean);
+        let is_frozen = mean > 0.0 && changes.count() >= FROZEN_CHANGES;
+        is_frozen.then(|| Self { value, line, along, contrast: light.std(0.0) / mean })
+    }
+}
+
+/// Runs along the rows.
+fn runs_of_rows(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<Run> {
     let mut runs = Vec::new();
-    for (line, (values, light)) in values.outer_iter().zip(light.outer_iter()).enumerate() {
-        let mut start = 0;
-        while start < values.len() {
-            let value = values[start];
-            let end = (start..values.len()).find(|at| values[*at] != value);
-            let along = start..end.unwrap_or(values.len()).max(start + 1);
-            start = along.end;
-            if along.len() <= FROZEN_CHANGES || !value.is_finite() {
-                continue;
+    for (line, lines) in values.outer_iter().zip(light.outer_iter()).enumerate() {
+        let (mut start, width) = (0, lines.0.len());
+        for at in 1..=width {
+            if at == width || lines.0[at] != lines.0[at - 1] {
+                runs.extend(Run::new(lines, (line, start..at)));
+                start = at;
             }
-            let light = light.slice(ndarray::s![along.clone()]);
-            let mean = light.mean().unwrap_or(0.0);
-            let changes = light
-                .windows(2)
-                .into_iter()
-                .filter(|pair| (pair[1] - pair[0]).abs() > LIGHT_CHANGE * mean);
-            if mean > 0.0 && changes.count() >= FROZEN_CHANGES {
-                runs.push(Run { value, line, along, contrast: light.std(0.0) / mean });
+        }
+    }
+    runs
+}
+
+/// Runs along the columns, which are read row by row.
+fn runs_of_columns(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<Run> {
+    let (height, width) = values.dim();
+    let (mut runs, mut starts) = (Vec::new(), vec![0; width]);
+    for at in 1..=height {
+        for (line, start) in starts.iter_mut().enumerate() {
+            if at == height || values[[at, line]] != values[[at - 1, line]] {
+                runs.extend(Run::new(
+                    (values.column(line), light.column(line)),
+                    (line, *start..at),
+                ));
+                *start = at;
             }
         }
     }
