@@ -289,7 +289,22 @@ impl Input {
     }
 }
 
-/// True if a resource has all values of a request that it repeats. Names are free.
+/// Fields of a resource that are empty unless the request states them.
+const STATED: [&str; 10] = [
+    "bad_pixels",
+    "camera_fps",
+    "crop",
+    "dark",
+    "dispersion",
+    "exposure_s",
+    "frames",
+    "mosaic",
+    "packing",
+    "saturation",
+];
+
+/// True if a resource agrees with the request that is `stated` to have made it: it has all values of the request, and no
+/// others. Names are free.
 fn agrees(stated: &Map<String, Value>, found: &Value) -> bool {
     let differs = |was: &Value, is: &Value| {
         #[allow(clippy::cast_possible_truncation)] // a scale has 32 bits
@@ -298,9 +313,17 @@ fn agrees(stated: &Map<String, Value>, found: &Value) -> bool {
             _ => was != is,
         }
     };
-    stated.iter().filter(|(name, was)| *name != "name" && !was.is_null()).all(|(name, was)| {
-        let is = found.get(name).or_else(|| found.get("reading")?.get(name));
-        is.is_none_or(|is| !differs(was, is))
+    let is_empty = |value: &Value| value.is_null() || value.as_array().is_some_and(Vec::is_empty);
+    let mut names = stated.keys().map(String::as_str).chain(STATED).filter(|name| *name != "name");
+    names.all(|name| {
+        let was = stated.get(name).filter(|was| !is_empty(was));
+        // The `frames` of a calibration are their number, those of its `reading` the range.
+        let is = found["reading"].get(name).or_else(|| found.get(name));
+        match (was, is) {
+            (Some(was), Some(is)) => !differs(was, is),
+            (None, Some(is)) => !STATED.contains(&name) || is_empty(is),
+            (_, None) => true,
+        }
     })
 }
 
@@ -479,6 +502,35 @@ mod tests {
         let missing = compared(manifest(&["a"], 64), manifest(&["a", "b"], 64)).failure("x");
         assert!(missing.unwrap().contains("another processor or GPU"), "the same settings");
         assert!(compared(manifest(&[], 64), manifest(&[], 64)).failure("x").is_some());
+    }
+
+    #[test]
+    fn a_resource_agrees_with_its_request_and_with_no_other() {
+        let found = json!({
+            "name": "bench", "data": "a", "full_scale": 0.1, "camera_fps": null, "dark": [], "saturation": 4095,
+            "frames": 8, "reading": {"scale_basis": "stated", "crop": null, "frames": [2, 9]},
+        });
+        let agrees = |stated: Value| super::agrees(stated.as_object().unwrap(), &found);
+        let request = json!({"data": "a", "full_scale": 0.1, "saturation": 4095, "frames": [2, 9]});
+        assert!(agrees(request.clone()));
+        let with = |name: &str, value: Value| {
+            let mut request = request.clone();
+            request[name] = value;
+            request
+        };
+        for same in [("name", json!("other")), ("dark", json!([])), ("camera_fps", Value::Null)] {
+            assert!(agrees(with(same.0, same.1.clone())), "{same:?}");
+        }
+        for other in [
+            ("saturation", Value::Null),
+            ("saturation", json!(1023)),
+            ("frames", Value::Null),
+            ("full_scale", json!(0.2)),
+            ("dark", json!(["b"])),
+            ("camera_fps", json!(30)),
+        ] {
+            assert!(!agrees(with(other.0, other.1.clone())), "{other:?}");
+        }
     }
 
     #[test]
