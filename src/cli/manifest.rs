@@ -101,7 +101,11 @@ impl Manifest {
     /// Errors: a value of another form. All parts are parsed once.
     fn parse(value: Value) -> serde_json::Result<Self> {
         let manifest: Self = serde_json::from_value(value)?;
-        manifest.part::<Inputs>("inputs")?;
+        let inputs: Inputs = manifest.part("inputs")?;
+        let masks = inputs.calibration.get("masks").filter(|masks| !masks.is_null());
+        if masks.is_some_and(|masks| *masks != json!(inputs.masks_sha256)) {
+            return Err(serde::de::Error::custom("`masks` and `masks_sha256` differ"));
+        }
         manifest.part::<Map<String, Value>>("request")?;
         manifest.part::<Vec<Snapshot>>("snapshots")?;
         Ok(manifest)
@@ -290,11 +294,12 @@ impl Input {
 }
 
 /// Fields of a resource that are empty unless the request states them.
-const STATED: [&str; 10] = [
+const STATED: [&str; 11] = [
     "bad_pixels",
     "camera_fps",
     "crop",
     "dark",
+    "data",
     "dispersion",
     "exposure_s",
     "frames",
@@ -314,6 +319,11 @@ fn agrees(stated: &Map<String, Value>, found: &Value) -> bool {
         }
     };
     let is_empty = |value: &Value| value.is_null() || value.as_array().is_some_and(Vec::is_empty);
+    let has_scale = stated.get("full_scale").is_some_and(|scale| !scale.is_null());
+    // The service states the scale of masks that it has made.
+    if stated.contains_key("data") && found["reading"]["scale_basis"] == "stated" && !has_scale {
+        return false;
+    }
     let mut names = stated.keys().map(String::as_str).chain(STATED).filter(|name| *name != "name");
     names.all(|name| {
         let was = stated.get(name).filter(|was| !is_empty(was));
@@ -525,6 +535,8 @@ mod tests {
             ("saturation", Value::Null),
             ("saturation", json!(1023)),
             ("frames", Value::Null),
+            ("data", Value::Null),
+            ("full_scale", Value::Null),
             ("full_scale", json!(0.2)),
             ("dark", json!(["b"])),
             ("camera_fps", json!(30)),

@@ -147,9 +147,14 @@ pub fn outliers(
 /// A line of pixels is dead if this share of at least this many pixels is.
 const DEAD_LINE: f64 = 0.8;
 const MIN_LINE: usize = 16;
+/// A line is not dead if this share of its pixels has light. More dead lines than this share are lines of the scene.
+const MAX_ALIVE: f64 = 0.05;
 
 /// Pixels of dead rows and columns of a sensor. Each is compared with the pixels on both sides of its line, because those
 /// along it are dead too. The arguments are those of [`outliers`].
+///
+/// At an edge of the scene one side is dark, so both sides must be bright.
+#[allow(clippy::cast_precision_loss)] // counts of pixels
 fn dead_lines(
     y: ArrayView2<'_, f32>,
     light: ArrayView2<'_, f32>,
@@ -158,30 +163,34 @@ fn dead_lines(
 ) -> Vec<(usize, usize)> {
     let (height, width) = y.dim();
     let is_dead = |row: usize| {
-        let (mut dead, mut compared) = (0usize, 0usize);
+        let (mut dead, mut compared, mut alive) = (0usize, 0usize, 0usize);
+        let sides = [row.checked_sub(step), Some(row + step).filter(|row| *row < height)];
         for column in 0..width {
-            let (mut near, mut near_light) = (0.0, 0.0);
-            for other in [row.checked_sub(step), Some(row + step)].into_iter().flatten() {
-                if other < height && y[[other, column]].is_finite() {
-                    near += y[[other, column]];
-                    near_light += light[[other, column]];
-                }
+            let (value, own) = (y[[row, column]], light[[row, column]]);
+            if value.is_nan() {
+                continue;
             }
-            let own = light[[row, column]];
-            let comparable =
-                own > MUCH_LIGHT * mean_light && near_light > ENOUGH_LIGHT * mean_light;
-            let expected = own * near / near_light;
-            if comparable && expected > deficit && !y[[row, column]].is_nan() {
+            alive += usize::from(value > deficit);
+            let sides = sides.into_iter().flatten();
+            let brightness = sides.map(|side| (y[[side, column]], light[[side, column]]));
+            let darker = brightness.fold(f32::INFINITY, |darker, (near, light)| {
+                let is_known = light > ENOUGH_LIGHT * mean_light && !near.is_nan();
+                darker.min(if is_known { near / light } else { 0.0 })
+            });
+            let expected = own * darker;
+            if own > MUCH_LIGHT * mean_light && expected > deficit && expected.is_finite() {
                 compared += 1;
-                dead += usize::from(y[[row, column]] < TOO_DARK * expected);
+                dead += usize::from(value < TOO_DARK * expected);
             }
         }
-        #[allow(clippy::cast_precision_loss)] // counts of pixels
         let share = dead as f64 / compared.max(1) as f64;
-        compared >= MIN_LINE && share > DEAD_LINE
+        compared >= MIN_LINE && share > DEAD_LINE && alive as f64 <= MAX_ALIVE * width as f64
     };
-    let rows = (0..height).filter(|row| is_dead(*row));
-    rows.flat_map(|row| (0..width).map(move |column| (row, column))).collect()
+    let rows: Vec<usize> = (0..height).filter(|row| is_dead(*row)).collect();
+    if rows.len() as f64 > MAX_ALIVE * height as f64 {
+        return Vec::new();
+    }
+    rows.into_iter().flat_map(|row| (0..width).map(move |column| (row, column))).collect()
 }
 
 /// A run of equal values is frozen if the light of the masks changes this often within it, each time by this share. Behind
@@ -189,14 +198,14 @@ fn dead_lines(
 const FROZEN_CHANGES: usize = 8;
 const LIGHT_CHANGE: f32 = 0.02;
 
-/// Pixels of frozen parts of the sensor: runs along rows or columns with one value, well above the darkest, although the
+/// Pixels of frozen parts of the sensor: runs along rows or columns with one value, well above the black level, although the
 /// masks let different light through. `values` \[H,W\] are as stored, NaN where nothing was measured; `light` \[H,W\] is the
 /// sum of the masks.
 ///
 /// Integers that are coarser than the changes of the light may be equal by chance, so they are not compared.
 fn frozen(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<(usize, usize)> {
     let finite = || values.iter().copied().filter(|value| value.is_finite());
-    let (low, high) = limits(finite());
+    let (low, high) = (black_level(finite()), limits(finite()).1);
     let rows = runs_of_rows(values, light).into_iter().map(|run| (run, false));
     let columns = runs_of_columns(values, light).into_iter().map(|run| (run, true));
     let mut all: Vec<_> = rows.chain(columns).collect();
@@ -222,6 +231,20 @@ fn frozen(values: ArrayView2<'_, f32>, light: ArrayView2<'_, f32>) -> Vec<(usize
     places.sort_unstable();
     places.dedup();
     places
+}
+
+/// Share of the values, without zeros, that are below the black level.
+const BELOW_BLACK: f64 = 0.05;
+
+/// The level of the darkest parts of a snapshot, whatever a few dead pixels and a border of zeros hold.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)] // counts of pixels
+fn black_level(values: impl Iterator<Item = f32>) -> f32 {
+    let mut values: Vec<f32> = values.filter(|value| *value != 0.0).collect();
+    if values.is_empty() {
+        return 0.0;
+    }
+    let index = (values.len() as f64 * BELOW_BLACK) as usize;
+    *values.select_nth_unstable_by(index, f32::total_cmp).1
 }
 
 /// Equal values along a line.
@@ -388,6 +411,25 @@ const MAX_MISSING: f64 = 0.5;
 /// Side of the areas that are searched for measured pixels.
 const AREA: usize = 16;
 
+/// Smallest share of a picture without an open mask that is reported.
+const MIN_CLOSED: f64 = 0.002;
+
+/// Reports areas in which no mask is open. `light` \[H,W\] is the sum of the masks, NaN where they are not known.
+#[allow(clippy::cast_precision_loss)] // counts of pixels
+pub fn judge_light(light: ArrayView2<'_, f32>) -> Option<Finding> {
+    let areas = light.exact_chunks((AREA, AREA)).into_iter();
+    let closed = areas.filter(|area| area.iter().all(|light| *light == 0.0)).count();
+    let share = (AREA * AREA * closed) as f64 / light.len().max(1) as f64;
+    (share > MIN_CLOSED).then(|| {
+        let detail = format!(
+            "at least {:.1} % of the picture lies in areas where no mask is open: the frames are black there, and the expected \
+             PSNR does not count these areas",
+            100.0 * share
+        );
+        Finding::new(FindingCode::DeadPixels, detail)
+    })
+}
+
 /// Reports the defects of a snapshot of `pixels` pixels.
 #[allow(clippy::cast_precision_loss)] // counts of pixels
 pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
@@ -440,7 +482,7 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::{AREA, Defects, MIN_PILE_UP, limits, outliers, saturation};
+    use super::{AREA, Defects, MIN_PILE_UP, judge_light, limits, outliers, saturation};
     use crate::{iid_masks, measure, noisy, random_squares};
     use ndarray::{Array2, Array3, Axis, s};
 
@@ -518,6 +560,54 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Bars and boxes on black have rows and columns without light beside bright ones.
+    #[test]
+    fn edges_of_a_scene_are_no_dead_lines() {
+        let bars = |period: usize| {
+            move |_: usize, i: usize, _: usize| f32::from(u8::from(i / period % 2 == 0))
+        };
+        let boxed = |k: usize, i: usize, j: usize| {
+            let at = 20 + 2 * k;
+            f32::from(u8::from((at..at + 30).contains(&i) && (30..70).contains(&j)))
+        };
+        for masks in all_masks(8) {
+            let light = masks.sum_axis(Axis(0));
+            let check = |name: &str, scene: &dyn Fn(usize, usize, usize) -> f32| {
+                let scene = Array3::from_shape_fn((8, 96, 96), |(k, i, j)| scene(k, i, j));
+                let y = measure(masks.view(), scene.view()).unwrap();
+                assert_eq!(outliers(y.view(), light.view(), 1), [], "{name}");
+            };
+            check("box", &boxed);
+            for period in [1, 2, 4, 8] {
+                check(&format!("bars of {period}"), &bars(period));
+            }
+        }
+    }
+
+    #[test]
+    fn a_black_background_is_not_frozen_beside_zeros() {
+        let masks = iid_masks(8, 96, 96, 3).unwrap();
+        let light = masks.sum_axis(Axis(0));
+        let mut object = scene(8) - 0.2;
+        object.mapv_inplace(|x| x.max(0.0));
+        let y = measure(masks.view(), object.view()).unwrap();
+        let high = y.iter().copied().fold(0.0, f32::max);
+        let mut y = y.mapv(|y| 16.0 + (60.0 * y / high).round());
+        y.slice_mut(s![..4, ..]).fill(0.0);
+        y[[50, 90]] = 0.0;
+        let found = Defects::mark(&mut y, None, light.view(), (1, None));
+        assert_eq!(found.frozen, 0);
+    }
+
+    #[test]
+    fn areas_without_an_open_mask_are_reported() {
+        let mut light = Array2::from_elem((96, 96), 4.0);
+        assert_eq!(judge_light(light.view()), None);
+        light.slice_mut(s![16..48, 32..64]).fill(0.0);
+        let found = judge_light(light.view()).unwrap();
+        assert!(found.detail.contains("11.1 %"), "{found:?}");
     }
 
     /// A patch or a line of one value in the middle of the range is no scene behind these masks.

@@ -82,7 +82,7 @@ const REDUCE_EXPOSURE: &str =
 
 // Each code has the subjects, the usual severity with that of grave cases, the title and the remedy.
 findings! {
-    DeadPixels: [Calibration], [Warning, Error],
+    DeadPixels: [Calibration, Measurement], [Warning, Error],
         "pixels are dark in every mask",
         "look at the Gram map of the report: dust or a displaced mask darkens whole areas, too few repeats darken \
          single pixels";

@@ -34,7 +34,7 @@ mod study;
 pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
 pub use calibration_check::{CaptureFigures, PatternFigures, judge_captures, judge_masks};
 pub use camera::{Camera, illumination};
-pub use defects::{Defects, judge_defects};
+pub use defects::{Defects, judge_defects, judge_light};
 pub use dispersion::{Dispersion, DispersionAxis, DispersionError, MAX_BANDS, MaskExtent};
 pub use displacement::{Displacement, Magnified, central, displacement, magnification, magnified};
 pub use distortion::Distortion;

@@ -15,7 +15,9 @@ use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use super::calibration_check::mask_scale;
 use super::distortion::{Distortion, Part, distortion};
 use super::mask_values::{Alteration, Observed, alteration};
-use super::measurement_fit::{BLOCK, Fit, Strip, brightness_errors, equal_weights, reweighted};
+use super::measurement_fit::{
+    BLOCK, Fit, LocalFit, Strip, brightness_errors, equal_weights, reweighted,
+};
 use super::{Finding, FindingCode};
 
 /// Largest shift between masks and measurement that is searched, in pixels along each axis.
@@ -61,11 +63,17 @@ const MIN_INVERTED: f64 = 0.05;
 const MIN_NEGATIVE: f64 = 0.5;
 /// Masks that explain less than this share of the fine structure show no displacement.
 const MIN_EXPLAINED: f64 = 0.02;
+/// Masks whose balance is below this have a nearly constant sum. The mean light of the frames then leaves no fine structure.
+const MIN_BALANCE: f64 = 0.3;
+/// Fits of single blocks show the masks of a measurement from this gain and significance on.
+const MIN_LOCAL_GAIN: f64 = 0.1;
+const LOCAL_SIGNIFICANCE: f64 = 4.0;
 /// A snapshot is a copy of a mask if it has no light of other masks, and if that mask explains this share.
 const COPY: f64 = 0.95;
 /// A snapshot is flat if its pixels differ from the mean of their block by less than this share of the mean of the
 /// measurement. Values with single precision have that rounding error.
 const FLAT: f64 = 1e-6;
+const FLAT_BEHIND_BALANCED: f64 = 0.05;
 /// Side of the parts with a displacement each, in blocks.
 const PART: usize = 4;
 
@@ -141,6 +149,8 @@ pub struct MeasurementFigures {
     pub brightest_block: f64,
     /// True if the measurement has no fine structure, so that no fit was possible.
     pub is_flat: bool,
+    /// Fits of single blocks, where the mean brightness of the frames explains too little or the masks have a constant sum.
+    pub local: Option<LocalFit>,
 }
 
 /// Comparison of the masks with those displaced by one pixel to and fro along an axis, by the square roots of the shares
@@ -278,8 +288,12 @@ impl MeasurementStudy {
         let limit = -NEGATIVE_SHARE * mean.abs();
         let negative = blocks().filter(|(mean, _)| **mean < limit).map(|(_, measured)| measured);
         let negative_area = negative.sum::<f64>() / measured;
-        if self.energy <= self.pixels * (FLAT * mean).powi(2) {
-            return (mean != 0.0).then(|| self.flat(mean, negative_area, fit.is_some()));
+        // Masks with a constant sum leave no structure of a still scene, so noise is all that there is.
+        let balanced = fit.as_ref().is_some_and(|fit| fit.balance < MIN_BALANCE);
+        let flat = if balanced { FLAT_BEHIND_BALANCED } else { FLAT };
+        if self.energy <= self.pixels * (flat * mean).powi(2) {
+            let masks_vary = fit.is_some() && !balanced;
+            return (mean != 0.0).then(|| self.flat(mean, negative_area, masks_vary));
         }
         let fit = fit?;
         let explained = |correlations: &Array1<f64>| {
@@ -320,6 +334,7 @@ impl MeasurementStudy {
         });
         let (brightest, brightest_block) = brightest(&self.strips, weighted.offset);
         let uncertainty = brightness_errors(&self.strips, &weighted, &weights);
+        let is_weak = unshifted < MIN_EXPLAINED || fit.balance < MIN_BALANCE;
         Some(MeasurementFigures {
             pixels: self.pixels,
             mean,
@@ -337,6 +352,7 @@ impl MeasurementStudy {
             brightest,
             brightest_block,
             is_flat: false,
+            local: is_weak.then(|| LocalFit::new(&self.strips)),
             shift: (pixels_from_centre(row), pixels_from_centre(column)),
             explained: explained_shifted,
             explained_unshifted: unshifted,
@@ -557,6 +573,16 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
             negative * 100.0
         );
         findings.push(Finding::new(FindingCode::Negative, detail).escalate_if(negative > 0.1));
+    }
+    // The masks fit, and the other figures, which need the mean brightness of the frames, are meaningless.
+    if figures
+        .local
+        .is_some_and(|local| local.gain > MIN_LOCAL_GAIN && local.significance > LOCAL_SIGNIFICANCE)
+    {
+        if !has_mask_scale {
+            findings.extend(implausible_brightness(figures));
+        }
+        return findings;
     }
     // Without a correct fit the other figures are meaningless, so the checks end at the first of these.
     let wrong = copy_of_a_mask(figures)
@@ -883,6 +909,57 @@ mod tests {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             if state >> 31 == 1 { 1.0 } else { 0.0 }
         })
+    }
+
+    /// Masks whose sum is the same everywhere: each pixel is open in half of the frames.
+    fn balanced_masks(frames: usize, side: usize) -> Array3<f32> {
+        let half = fine_masks(frames / 2, side);
+        ndarray::concatenate![ndarray::Axis(0), half, 1.0 - &half]
+    }
+
+    /// Discs on black that cover little of the picture.
+    fn cells(frames: usize, side: usize) -> Array3<f32> {
+        Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
+            let near = |row: f32, column: f32, radius: f32| {
+                (i as f32 - row - k as f32).hypot(j as f32 - column) < radius
+            };
+            let is_cell = near(30.0, 40.0, 8.0) || near(90.0, 70.0, 10.0) || near(60.0, 100.0, 9.0);
+            if is_cell { 0.8 } else { 0.0 }
+        })
+    }
+
+    #[test]
+    fn masks_with_a_constant_sum_and_sparse_scenes_are_not_foreign() {
+        let (masks, balanced) = (fine_masks(8, 136), balanced_masks(8, 136));
+        let mut unpaired = balanced.clone();
+        unpaired.index_axis_mut(ndarray::Axis(0), 7).assign(&fine_masks(1, 136).slice(s![
+            0,
+            ..,
+            ..
+        ]));
+        let still = Array3::from_elem((8, 136, 136), 0.5f32);
+        for (name, masks, scene) in [
+            ("balanced", &balanced, scene(8, 136)),
+            ("flat", &balanced, still),
+            ("unpaired", &unpaired, scene(8, 136)),
+            ("cells", &masks, cells(8, 136)),
+            ("balanced cells", &balanced, cells(8, 136)),
+        ] {
+            let y = measure(masks.view(), scene.view()).unwrap();
+            let y = noisy(y, 0.01, 1).unwrap();
+            let mut study = MeasurementStudy::new(8);
+            study.add(masks.view(), y.view(), (0, 0));
+            let f = study.finish().unwrap();
+            eprintln!("{name} {:?} {} {}", f.local, f.explained_unshifted, f.is_flat);
+            let found = codes(masks, &y);
+            eprintln!("{name} {found:?}");
+        }
+        // Other masks are noticed.
+        let other = balanced.slice(s![.., ..;-1, ..]).to_owned();
+        let y = measure(other.view(), scene(8, 136).view()).unwrap();
+        assert_ne!(codes(&balanced, &y), [""; 0]);
+        let y = measure(masks.slice(s![.., ..;-1, ..]), cells(8, 136).view()).unwrap();
+        assert_eq!(codes(&masks, &y), ["foreign_masks"]);
     }
 
     #[test]

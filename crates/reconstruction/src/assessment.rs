@@ -173,21 +173,29 @@ pub enum Coverage {
     Dark,
     /// Hardly any of its pixels was measured, so that its frames are a guess.
     Unmeasured,
+    /// In hardly any of its pixels a mask is open, so that its frames are black.
+    Closed,
 }
 
 /// Smallest share of the pixels of a block that must be measured.
 const MIN_MEASURED: f32 = 1.0 / 16.0;
 
-/// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\]. NaN were not measured.
-pub fn coverage(y: ArrayView3<'_, f32>) -> Array3<Coverage> {
+/// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\] behind masks with the sum `light` \[H,W\]. NaN
+/// were not measured.
+pub fn coverage(y: ArrayView3<'_, f32>, light: ArrayView2<'_, f32>) -> Array3<Coverage> {
     let (snapshots, height, width) = y.dim();
     let (rows, columns) = blocks(height, width);
     let mut all = Array3::from_elem((snapshots, rows, columns), Coverage::Measured);
+    let share = |is: &dyn Fn(usize, usize) -> bool| {
+        over_blocks((height, width), |i, j| f32::from(u8::from(is(i, j))))
+    };
+    let closed = share(&|i, j| light[[i, j]] == 0.0);
     for (y, mut all) in y.outer_iter().zip(all.outer_iter_mut()) {
         let is_dark = y.iter().all(|value| value.is_nan() || *value == 0.0);
-        let measured = over_blocks(y.dim(), |i, j| if y[[i, j]].is_nan() { 0.0 } else { 1.0 });
-        all.zip_mut_with(&measured, |block, measured| {
+        let measured = share(&|i, j| light[[i, j]] > 0.0 && !y[[i, j]].is_nan());
+        Zip::from(&mut all).and(&measured).and(&closed).for_each(|block, measured, closed| {
             *block = match () {
+                () if *measured < MIN_MEASURED && *closed > 0.5 => Coverage::Closed,
                 () if *measured < MIN_MEASURED => Coverage::Unmeasured,
                 () if is_dark => Coverage::Dark,
                 () => Coverage::Measured,

@@ -145,7 +145,7 @@ pub(crate) fn run_stages(
         stop_reason: if converged { StopReason::Converged } else { StopReason::MaxIterations },
         features: Vec::new(),
         evidence: None,
-        coverage: coverage(y),
+        coverage: coverage(y, op.masks().sum_axis(ndarray::Axis(0)).view()),
     })
 }
 

@@ -12,6 +12,7 @@ import inspect
 import json
 import os
 import time
+import unicodedata
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -125,10 +126,12 @@ class Watch:
             or not path.is_file()
         ):
             return None
-        if len(path.name.encode("utf-8", "surrogateescape")) > MAX_NAME:
+        trouble = self._trouble(path.name)
+        if trouble is not None:
             if path.name not in self.skipped:
                 self.skipped.add(path.name)
-                print(f"{path.name} is skipped: the name has more than {MAX_NAME} bytes; rename the file", flush=True)
+                shown = "".join(c if c.isprintable() else "\ufffd" for c in path.name)
+                print(f"{shown} is skipped: {trouble}; rename the file", flush=True)
             return None
         try:
             meta = path.stat()
@@ -136,6 +139,17 @@ class Watch:
             return None
         text = f"{path.name} {meta.st_size} {meta.st_mtime_ns}"
         return "watch-" + hashlib.sha256(text.encode()).hexdigest() if meta.st_size else None
+
+    @staticmethod
+    def _trouble(name: str) -> str | None:
+        """The reason why a file of this name is never submitted."""
+        try:
+            size = len(name.encode())
+        except UnicodeEncodeError:
+            return "the name is not UTF-8"
+        if any(unicodedata.category(character) == "Cc" for character in name):
+            return "the name has control characters"
+        return f"the name has more than {MAX_NAME} bytes" if size > MAX_NAME else None
 
     def _advance(self, key: str, path: Path, job: Job) -> None:
         if job.refresh().state not in ENDED:
@@ -197,6 +211,6 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
 
     def submit(path: Path, key: str) -> Job:
         taken = client.measure(calibration, path, key=key, **measurement)
-        return client.submit(taken, key=key, **{"label": path.name, **job})
+        return client.submit(taken, key=key, **{"label": path.name[:200], **job})
 
     return submit

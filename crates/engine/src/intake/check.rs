@@ -17,7 +17,7 @@ use formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use formats::{
     self, Expected, FormatError, FrameReader, Limits, Part, SampleType, StackInfo, Wanted,
 };
-use optics::{BitUsage, Defects, judge_defects};
+use optics::{BitUsage, Defects, judge_defects, judge_light};
 
 /// Number of snapshots that findings of one kind name.
 const SNAPSHOTS: usize = 8;
@@ -141,6 +141,7 @@ pub fn measurement(
     let judge = |bits: BitUsage| bits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
     // Saturation explains why no value is larger, so it comes first.
     let mut findings = defect_findings(&exposed.defects, info.height * info.width);
+    findings.extend(judge_light(behind.light.view()).map(Finding::from));
     findings.extend(exposed.bits.and_then(judge).map(Finding::from));
     findings.extend(dark.into_iter().take(SNAPSHOTS).map(|(snapshot, state)| {
         let finding = Finding::new(FindingCode::EmptySnapshot, format!("the snapshot {state}"));

@@ -45,6 +45,8 @@ const LEVELS_PER_DB: f32 = 4.0;
 const DARK: u8 = u8::MAX;
 /// The level of blocks that were not measured.
 const UNMEASURED: u8 = u8::MAX - 1;
+/// The level of blocks without an open mask, which do not count.
+const CLOSED: u8 = u8::MAX - 2;
 /// Expected PSNR of blocks that were not measured, in dB. Half a picture that the priors fill has 6 dB, a tenth 8 to 12 dB.
 const UNMEASURED_DB: f64 = 10.0;
 
@@ -62,7 +64,7 @@ impl TileAssessment {
         let unfamiliar = outcome.features.iter().any(|piece| unfamiliar_masks(&piece.blocks));
         let offset = if unfamiliar { model.misses.unfamiliar.offset } else { 0.0 };
         let level = |error: &f32| {
-            ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, f32::from(UNMEASURED - 1))
+            ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, f32::from(CLOSED - 1))
                 as u8
         };
         let mut levels = vec![DARK; frames * rows * columns];
@@ -77,6 +79,7 @@ impl TileAssessment {
                 Coverage::Measured => continue,
                 Coverage::Dark => DARK,
                 Coverage::Unmeasured => UNMEASURED,
+                Coverage::Closed => CLOSED,
             };
             for k in snapshot * ratio..(snapshot + 1) * ratio {
                 levels[(k * rows + row) * columns + column] = level;
@@ -110,7 +113,7 @@ impl TileAssessment {
     /// True if light was measured of a frame.
     fn is_lit(&self, frame: usize) -> bool {
         let blocks = self.size.0 * self.size.1;
-        self.levels.iter().skip(frame * blocks).take(blocks).any(|level| *level < UNMEASURED)
+        self.levels.iter().skip(frame * blocks).take(blocks).any(|level| *level < CLOSED)
     }
 
     fn level(&self, frame: usize, row: usize, column: usize) -> u8 {
@@ -122,6 +125,7 @@ impl TileAssessment {
     fn error(&self, frame: usize, row: usize, column: usize) -> f64 {
         let decibels = match self.level(frame, row, column) {
             UNMEASURED => UNMEASURED_DB,
+            CLOSED => return 0.0,
             level => f64::from(level) / f64::from(LEVELS_PER_DB),
         };
         10f64.powf(-decibels / 10.0)
@@ -151,7 +155,7 @@ pub fn expected(
     let (height, width) = plan.dim();
     let (rows, columns) = blocks(height, width);
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
-    let mut unmeasured = squares.clone();
+    let (mut unmeasured, mut open) = (squares.clone(), squares.clone());
     let block_centre = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
     let (mut lit, mut motion, mut unfamiliar) = (false, 0.0f32, false);
     let (mut predictions, mut orders) = (Vec::new(), Vec::new());
@@ -181,8 +185,12 @@ pub fn expected(
                         let block = (share.frame(k), i / BLOCK, j / BLOCK);
                         squares[[k, row, column]] +=
                             weight * assessed.error(block.0, block.1, block.2);
-                        if assessed.level(block.0, block.1, block.2) == UNMEASURED {
+                        let level = assessed.level(block.0, block.1, block.2);
+                        if level == UNMEASURED {
                             unmeasured[[k, row, column]] += weight;
+                        }
+                        if level != CLOSED {
+                            open[[k, row, column]] += weight;
                         }
                     }
                 }
@@ -195,10 +203,12 @@ pub fn expected(
         let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
         return Some(Expected { assessment: Assessment::empty(warnings), error });
     }
-    let psnr = |frame: ndarray::ArrayView2<'_, f64>| {
-        -10.0 * (frame.mean().unwrap_or(0.0).max(1e-12) * (unit / peak).powi(2)).log10()
+    let psnr = |(frame, open): (ndarray::ArrayView2<'_, f64>, ndarray::ArrayView2<'_, f64>)| {
+        let mean = frame.sum() / open.sum().max(f64::MIN_POSITIVE);
+        -10.0 * (mean.max(1e-12) * (unit / peak).powi(2)).log10()
     };
-    let psnr_db = squares.outer_iter().map(psnr).sum::<f64>() / frames as f64;
+    let pairs = squares.outer_iter().zip(open.outer_iter());
+    let psnr_db = pairs.map(psnr).sum::<f64>() / frames as f64;
     let bound = |offset: f64| (psnr_db + offset).min(Assessment::MAX_PSNR_DB);
     let misses = &model.misses;
     let is_guess = unmeasured.mean() > Some(MAX_UNMEASURED);
@@ -383,7 +393,7 @@ const PARTS: [[&str; 3]; 3] = [
 #[cfg(test)]
 mod tests {
     use super::{
-        DARK, Prediction, TileAssessment, UNMEASURED, expected, grade, unverifiable_order,
+        CLOSED, DARK, Prediction, TileAssessment, UNMEASURED, expected, grade, unverifiable_order,
     };
     use crate::job::{Assessment, Finding, FindingCode, Grade, Severity};
     use reconstruction::order::Order;
@@ -524,7 +534,7 @@ mod tests {
         assert!(assess(incomplete).is_none());
         // Tiles without light do not contribute, and no figure is stated of a snapshot without light.
         let all = |level| Some(TileAssessment { levels: vec![level; 8], motion: 0.0, ..tile(0) });
-        for level in [DARK, UNMEASURED] {
+        for level in [DARK, UNMEASURED, CLOSED] {
             let empty = assess(vec![all(level); 4]).unwrap().assessment;
             assert_eq!((empty.grade, empty.psnr_db), (Grade::Bad, None));
             assert!(empty.is_empty(), "{empty:?}");
@@ -534,6 +544,10 @@ mod tests {
         let lit = assess(lit).unwrap();
         assert!(lit.error[[0, 2, 2]] < 0.1 * lit.error[[0, 0, 0]]);
         // Tiles that were not measured lower the figure, and widen its interval.
+        let mut closed = tiles([25; 4]);
+        closed[3] = all(CLOSED);
+        let closed = assess(closed).unwrap().assessment.psnr_db.unwrap();
+        assert!((closed - psnr).abs() < 0.2, "{closed}: closed areas do not count");
         let mut partial = tiles([35; 4]);
         partial[3] = all(UNMEASURED);
         let partial = assess(partial).unwrap().assessment;

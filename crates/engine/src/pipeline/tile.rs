@@ -78,7 +78,7 @@ impl TileInput {
             stop_reason: StopReason::Converged,
             features: Vec::new(),
             evidence: None,
-            coverage: coverage(measured.view()),
+            coverage: coverage(measured.view(), self.masks.sum_axis(Axis(0)).view()),
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(combined) };
         let total: usize = pieces.iter().map(Range::len).sum();
@@ -158,7 +158,7 @@ pub fn run_network(
         Ok(Outcome {
             features: Vec::new(),
             evidence: None,
-            coverage: coverage(y),
+            coverage: coverage(y, op.masks().sum_axis(Axis(0)).view()),
             // Networks know no missing pixels.
             frames: network.frames(filled(y.index_axis(Axis(0), 0)).view(), op.masks())?,
             iterations: 0,
