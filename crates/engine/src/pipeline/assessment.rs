@@ -217,7 +217,9 @@ pub fn expected(
     let [low, high] = interval.map(bound);
     let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
     let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);
-    let mut reasons = reasons((&error, &unmeasured), (psnr_db, peak), warnings);
+    let unresolved =
+        if spectral { "fine texture or spectral detail" } else { "fine texture or fast motion" };
+    let mut reasons = reasons((&error, &unmeasured), (psnr_db, peak), unresolved, warnings);
     reasons.extend(unexplained_pixels(&predictions));
     reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
@@ -322,10 +324,11 @@ const MAX_UNMEASURED: f64 = 0.01;
 const UNEVEN_DB: f64 = 4.0;
 
 /// The findings of the checks, and the worst part of the picture, from the error and the unmeasured share of each block.
-/// `peak` is the peak of the PSNR.
+/// `peak` is the peak of the PSNR, and `unresolved` names what the masks may fail to resolve.
 fn reasons(
     (error, unmeasured): (&Array3<f32>, &Array3<f64>),
     (psnr_db, peak): (f64, f64),
+    unresolved: &str,
     warnings: &[Finding],
 ) -> Vec<Finding> {
     let mut reasons = warnings.to_vec();
@@ -352,7 +355,7 @@ fn reasons(
     if worst_db < psnr_db - UNEVEN_DB {
         let cause = match share > MAX_UNMEASURED {
             true => format!("{:.0} % of this part were not measured", 100.0 * share),
-            false => "the masks do not resolve fine texture or fast motion there".into(),
+            false => format!("the masks do not resolve {unresolved} there"),
         };
         let detail = format!(
             "{worst_part} of the picture has an expected PSNR of {worst_db:.0} dB, the whole picture one of \
