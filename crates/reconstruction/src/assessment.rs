@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use ndarray::{Array1, Array2, Array3, Array4, ArrayView2, ArrayView3, Axis, Zip};
+use ndarray::{Array1, Array2, Array3, Array4, ArrayView1, ArrayView2, ArrayView3, Axis, Zip};
 use serde::{Deserialize, Serialize};
 
 use super::error::Result;
@@ -111,6 +111,8 @@ pub struct Features {
     pub encoded: Option<Array4<f32>>,
     /// The first run of a stage that was run twice.
     pub first_run: Option<Box<FirstRun>>,
+    /// True if predictions are uncertain behind the masks; they are blurred, leak, or have a constant sum.
+    pub unfamiliar: bool,
 }
 
 /// The first run of a stage that was run twice.
@@ -136,7 +138,8 @@ impl Features {
     ) -> Result<Self> {
         let encoded = encoder.map(|encoder| encoder.encode(frames)).transpose()?;
         let blocks = block_features(op, early, frames);
-        Ok(Self { first_frame: 0, blocks, encoded, first_run: None })
+        let unfamiliar = unfamiliar_masks(&blocks) || have_constant_sum(op.masks());
+        Ok(Self { first_frame: 0, blocks, encoded, first_run: None, unfamiliar })
     }
 
     /// Adds the features of the weakly shrunk first run. `frames` are those of the result, `weak` those of that run.
@@ -393,7 +396,7 @@ const APERTURE_SHARPNESS: f32 = 0.28;
 
 /// True if predictions are uncertain behind the masks of these [`block_features`]. Such masks are blurred, or leak light
 /// through closed pixels, until they are at least as highly correlated as those of the hybrid coded aperture.
-pub fn unfamiliar_masks(features: &Array3<BlockFeatures>) -> bool {
+fn unfamiliar_masks(features: &Array3<BlockFeatures>) -> bool {
     let blocks = features.index_axis(Axis(0), 0);
     // A block that no light reaches has no contrast.
     let lit = || blocks.iter().filter(|block| block.mask_contrast > logarithm(0.0));
@@ -404,6 +407,23 @@ pub fn unfamiliar_masks(features: &Array3<BlockFeatures>) -> bool {
     let known = contrast >= APERTURE_CONTRAST.end
         || contrast >= APERTURE_CONTRAST.start && sharpness >= APERTURE_SHARPNESS;
     !known
+}
+
+/// Masks whose sum has this share of the gradients of independent masks have a nearly constant sum.
+const CONSTANT_SUM: f32 = 0.3;
+
+/// True if the sum of the masks \[B,H,W\] hardly changes from pixel to pixel, as that of complementary patterns. The quality
+/// model knows no such masks: it expects several dB too much.
+fn have_constant_sum(masks: ArrayView3<'_, f32>) -> bool {
+    let steps = |image: ArrayView2<'_, f32>| {
+        let squares = |row: ArrayView1<'_, f32>| {
+            row.windows(2).into_iter().map(|pair| (pair[1] - pair[0]).powi(2)).sum::<f32>()
+        };
+        image.outer_iter().map(squares).sum::<f32>()
+    };
+    let independent: f32 = masks.outer_iter().map(steps).sum();
+    let sum = masks.sum_axis(Axis(0));
+    masks.len_of(Axis(0)) > 1 && steps(sum.view()) < CONSTANT_SUM * independent
 }
 
 fn logarithm(energy: f32) -> f32 {
@@ -481,7 +501,7 @@ impl Evidence {
 
 #[cfg(test)]
 mod tests {
-    use super::{BlockFeatures, block_features, unfamiliar_masks};
+    use super::{BlockFeatures, Features, block_features};
     use crate::operator::SensingOperator;
     use ndarray::{Array3, s};
     use optics::{iid_masks, random_squares, soften};
@@ -536,8 +556,11 @@ mod tests {
         let unfamiliar = |masks: Array3<f32>| {
             let frames = Array3::zeros(masks.raw_dim());
             let op = SensingOperator::new(masks).unwrap();
-            unfamiliar_masks(&block_features(&op, None, frames.view()))
+            Features::of(&op, None, frames.view(), None).unwrap().unfamiliar
         };
+        let half = iid_masks(5, 64, 64, 3).unwrap();
+        let paired = ndarray::concatenate![ndarray::Axis(0), half, 1.0 - &half];
+        assert!(unfamiliar(paired), "complementary patterns");
         let iid = || iid_masks(10, 64, 64, 3).unwrap();
         let squares = || random_squares(10, 64, 64, 3).unwrap().0;
         let softened = |mut masks: Array3<f32>, blur, leak| {

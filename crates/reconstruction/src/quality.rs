@@ -38,7 +38,7 @@ pub struct Model {
 pub struct Misses {
     /// Ends of the interval that contains four of five true values, in dB relative to the predicted PSNR.
     pub interval: [f64; 2],
-    /// The correction behind [`unfamiliar_masks`](super::assessment::unfamiliar_masks).
+    /// The correction behind masks that are [`unfamiliar`](Features::unfamiliar).
     pub unfamiliar: Unfamiliar,
 }
 
@@ -425,7 +425,7 @@ mod tests {
         let evidence = Evidence::new(Signs(signs), &blocks.slice(s![..1, ..1, ..1]).to_owned());
         let features = |encoded| {
             let blocks = blocks.clone();
-            Features { first_frame: 0, blocks, encoded, first_run: None }
+            Features { first_frame: 0, blocks, encoded, first_run: None, unfamiliar: false }
         };
         for (name, model) in [
             ("gap-tv", &MODELS.total_variation),

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, withholds_quality};
 pub use reconstruction::assessment::{BLOCK, blocks};
-use reconstruction::assessment::{Coverage, Evidence, unfamiliar_masks};
+use reconstruction::assessment::{Coverage, Evidence};
 use reconstruction::hold_out::Prediction;
 use reconstruction::motion::fastest;
 use reconstruction::order::Order;
@@ -61,7 +61,7 @@ impl TileAssessment {
         let (frames, height, width) = outcome.frames.dim();
         let (rows, columns) = blocks(height, width);
         let evidence = outcome.evidence.as_ref().or(evidence);
-        let unfamiliar = outcome.features.iter().any(|piece| unfamiliar_masks(&piece.blocks));
+        let unfamiliar = outcome.features.iter().any(|piece| piece.unfamiliar);
         let offset = if unfamiliar { model.misses.unfamiliar.offset } else { 0.0 };
         let level = |error: &f32| {
             ((-10.0 * error + offset) * LEVELS_PER_DB).round().clamp(0.0, f32::from(CLOSED - 1))
@@ -381,8 +381,8 @@ fn fast_motion(motion: f32) -> Option<Finding> {
 }
 
 fn unfamiliar_masks_finding() -> Finding {
-    let detail = "the masks are highly correlated and not sharp: they are blurred, or closed pixels let light through. \
-                  The expected PSNR is often far from the true one behind such masks, so its interval is wider";
+    let detail = "the masks have a nearly constant sum, or they are highly correlated and not sharp: they are blurred, or \
+                  closed pixels let light through. The expected PSNR is often far from the true one behind such masks, so its interval is wider";
     Finding::new(FindingCode::UnfamiliarMasks, detail)
 }
 
