@@ -50,6 +50,11 @@ export async function faults(browser, checks, program, services) {
   await service.when(failed.id, (job) => job.state === "failed");
   await page.goto(`${service.url}/#/jobs/${failed.id}`);
   await page.waitForSelector(".onpicture:has-text('Failed')");
+  const reason = await page.textContent("#content .trouble");
+  checks.that(/^Preparing: the stored /.test(reason) && !/[0-9a-f]{64}/.test(reason) && reason.includes("Do what the detail says"), `the reason and the remedy agree: ${reason}`);
+  checks.that((await page.$(".trouble a[href='#/new']")) !== null, "damaged inputs lead to a new job");
+  const useless = [".verdictcard > p:last-child", ".verdictcard .findings", "#mode", ".probe", ".slicing"];
+  await checks.until(() => Promise.all(useless.map((place) => page.isVisible(place))), (seen) => !seen.some(Boolean), "a job without frames has neither grade nor controls");
   await checks.look(page, "failed");
   await page.goto(`${service.url}/#/jobs`);
   await page.waitForSelector(".badge.failed");

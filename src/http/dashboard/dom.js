@@ -70,9 +70,15 @@ export function facts(pairs) {
   return h("dl", { class: "facts" }, rows.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]));
 }
 
+/** A SHA-256, of which the first digits are enough to recognise it. */
+const HASH = /\b([0-9a-f]{8})[0-9a-f]{56}\b/g;
+
+/** A text of the service with a capital and short hashes. */
+export const capital = (text) => String(text).replace(HASH, "$1…").replace(/^./, (letter) => letter.toUpperCase());
+
 /** A text of the service, with the names in backticks as code. */
 export function marked(text) {
-  return String(text).split(/`([^`]+)`/).map((part, index) => (index % 2 ? h("code", null, part) : part));
+  return String(text).replace(HASH, "$1…").split(/`([^`]+)`/).map((part, index) => (index % 2 ? h("code", null, part) : part));
 }
 
 /** An error's text, with a link to the page that explains it. */

@@ -1,6 +1,6 @@
 // A canvas that shows an image of any size, and loads only the visible tiles.
 
-import { h, say } from "./dom.js";
+import { capital, h, say } from "./dom.js";
 import { isAborted, picture } from "./api.js";
 import { figure } from "./format.js";
 import { pixel } from "./values.js";
@@ -143,7 +143,7 @@ export class Pane {
   /** Shows a note in place of the image; an empty text hides it. */
   setNote(text) {
     this.note.hidden = !text;
-    say(this.note, text);
+    say(this.note, capital(text));
   }
 
   /** Discards the cached tiles, because the image has changed on the service. */

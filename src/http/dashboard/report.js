@@ -1,6 +1,6 @@
 // The report on a calibration: grade, findings with remedies, and correlation of the masks.
 
-import { facts, h, marked, put, s } from "./dom.js";
+import { capital, facts, h, marked, put, s } from "./dom.js";
 import { figure } from "./format.js";
 import { isAborted, get } from "./api.js";
 
@@ -88,7 +88,7 @@ async function load(item, body, signal) {
 function show(body, found) {
   const { masks, captures } = found;
   put(body,
-    h("p", { class: `judgement ${found.grade}` }, found.grade[0].toUpperCase() + found.grade.slice(1)),
+    h("p", { class: `judgement ${found.grade}` }, capital(found.grade)),
     findings(found.findings) ?? h("p", { class: "muted" }, "No fault found in the masks alone. Each measurement is checked for whether it belongs to them."),
     h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)),
     masks.correlation_mean !== null && h("p", { class: "muted" }, meaning(masks)),

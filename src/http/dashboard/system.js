@@ -1,6 +1,6 @@
 // State of the service: what an administrator looks for first, in words.
 
-import { facts, h, put } from "./dom.js";
+import { capital, facts, h, marked, put } from "./dom.js";
 import { bytes, duration, moment, momentInFull, nameOf, short } from "./format.js";
 import { every } from "./live.js";
 import { get } from "./api.js";
@@ -28,7 +28,7 @@ const count = (number, one, many = `${one}s`) => `${number === 0 ? "no" : number
 function summary({ jobs, workers: { length: alive }, disk: { free_bytes: free } }) {
   const [running, queued] = [jobs.running + jobs.cancelling, jobs.queued];
   const work = running + queued === 0 ? "No job runs or waits" : `${count(running, "job")} running, ${queued || "none"} waiting`;
-  return `${work[0].toUpperCase()}${work.slice(1)}; ${count(alive, "worker")} ready; ${bytes(free)} free.`;
+  return `${capital(work)}; ${count(alive, "worker")} ready; ${bytes(free)} free.`;
 }
 
 function card(title, ...content) {
@@ -75,7 +75,7 @@ function errors({ items }) {
   if (items.length === 0) return card("Last errors", h("p", { class: "muted" }, "No job of this lab has failed."));
   return card("Last errors", h("ul", { class: "findings" }, items.map((job) => h("li", { class: "error" },
     h("p", null, h("a", { href: `#/jobs/${job.id}` }, nameOf(job)), " ", h("span", { class: "muted" }, moment(job.finished_at))),
-    h("p", null, job.error)))));
+    h("p", null, marked(capital(job.error)))))));
 }
 
 function workers(found) {

@@ -47,12 +47,16 @@ export class Verdict {
     if (!written) {
       const words = { failed: ["Failed", "bad"], cancelled: ["Cancelled", ""], cancelling: ["Being cancelled", ""] }[job.state] ?? ["Not known yet", ""];
       const { previews_done: previews, tiles_done: tiles } = job.progress;
-      const ended = previews + tiles > 0 ? "The frames are incomplete: don’t rely on them." : "There are no frames.";
+      const isEmpty = previews + tiles === 0;
+      // Findings on the inputs do not explain why a job has no frames.
+      this.found.hidden = this.calibration.hidden = job.state === "failed" && isEmpty;
+      const ended = !isEmpty ? "The frames are incomplete: don’t rely on them." : "There are no frames.";
       this.judge(...words, job.state in { failed: 1, cancelled: 1, cancelling: 1 } ? ended : "The frames are judged when they are written.");
       put(this.measured);
       put(this.expected);
       return;
     }
+    this.found.hidden = this.calibration.hidden = false;
     const { content } = manifest;
     this.assessment = content?.assessment ?? null;
     put(this.found, findings(findingsOf(job, this.assessment)));

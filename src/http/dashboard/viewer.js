@@ -1,6 +1,6 @@
 // The frames in a large player, synchronised with the measurement.
 
-import { h, say } from "./dom.js";
+import { capital, h, say } from "./dom.js";
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
 import { Player } from "./player.js";
@@ -24,8 +24,6 @@ const MODES = [
 const SIGNED = ["difference", "deviation"];
 /** Pictures that are the same for all frames. */
 const STILL = ["colours", "residual"];
-
-const capital = (text) => text.replace(/^./, (letter) => letter.toUpperCase());
 
 export class Viewer {
   constructor(job, signal) {
@@ -65,9 +63,10 @@ export class Viewer {
     const picture = () => this.ready && { ...stack(), height: this.view.height, width: this.view.width, base: this.source(this.player.frame).base };
     this.probe = new Probe(this.right, axisOf(job), { picture, stack, called: () => capital(frameName(job, this.player.frame)), unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
     for (const pane of [this.left, this.right]) pane.describe = (value) => this.words(value);
-    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.meaning, this.probe.element, this.slicing,
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
-        h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`)));
+    const keys = h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
+      h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`));
+    this.controls = [this.player.element, this.rightContrast.element, this.right.tools, this.probe.element, this.slicing, keys];
+    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.meaning, this.probe.element, this.slicing, keys);
     this.measured = null;
     this.beside = h("section", { class: "card viewer beside", "aria-label": "Measurement" }, this.left.element);
     this.player.keys(this.element);
@@ -238,12 +237,14 @@ export class Viewer {
       this.ready = false;
       this.right.show(null);
       this.right.setNote(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "The job ended before any frame was computed." : "No frames yet. A coarse preview comes first, then the frames tile by tile.");
-      this.rightContrast.element.hidden = this.player.element.hidden = true;
+      // Other pictures of a job may be missing, but without frames there are none.
+      const unusable = this.mode() === "frame" ? this.controls : this.controls.slice(0, 2);
+      unusable.forEach((element) => (element.hidden = true));
       return;
     }
     this.ready = true;
+    this.controls.forEach((element) => (element.hidden = false));
     this.player.element.hidden = STILL.includes(this.mode());
-    this.rightContrast.element.hidden = false;
     this.right.setNote("");
     this.showRight();
   }
