@@ -1,7 +1,7 @@
 // Formats numbers, times and states for display.
 
 /** An expected PSNR; the model does not distinguish values above 40 dB. */
-export const aboutDecibels = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(0)} dB`);
+export const aboutDecibels = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(1)} dB`);
 
 /** The interval of an assessment's expected PSNR, or a dash where there is no figure. */
 export function expectedRange(assessment) {
