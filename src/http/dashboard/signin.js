@@ -1,6 +1,6 @@
 // Sign-in form, account view and sign-out.
 
-import { announce, facts, h, put, say } from "./dom.js";
+import { announce, facts, h, put } from "./dom.js";
 import { bytes } from "./format.js";
 import { selectLab, selectedLab } from "./storage.js";
 import { get, known, isUnreachable, signIn as beginSession, signOut as endSession } from "./api.js";
@@ -115,7 +115,7 @@ function signOut() {
 export async function nameplate(element) {
   try {
     const me = await get("/v1/me");
-    say(element, me.token ? `${selectedLab() ? "viewing " : ""}${me.lab} · ${me.role}` : me.lab);
+    put(element, me.token ? [`${selectedLab() ? "viewing " : ""}${me.lab}`, h("span", null, ` · ${me.role}`)] : me.lab);
     document.body.dataset.role = me.role;
     element.hidden = false;
     return true;
