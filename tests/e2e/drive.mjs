@@ -756,6 +756,8 @@ export async function captures(page, checks, scene) {
   await page.setInputFiles("#captures", [file("black.npy", black)]);
   await page.waitForSelector(`text=${patterns.length} patterns. Check their order`);
   checks.that((await page.$$(".capture canvas")).length === patterns.length + 2, "each capture has a thumbnail");
+  const shades = await page.$$eval(".capture canvas", (all) => all.slice(-2).map((canvas) => canvas.getContext("2d").getImageData(0, 0, 1, 1).data[0]));
+  checks.that(Math.min(...shades) < 20 && Math.max(...shades) > 200, `white and black captures look white and black: ${shades}`);
   const order = () => page.$$eval(".capture .filename", (lines) => lines.slice(0, 2).map((line) => line.textContent));
   checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `captures are sorted by name: ${await order()}`);
   await page.dragAndDrop(".capture:nth-child(1) .filename", ".capture:nth-child(2) .filename");
