@@ -117,6 +117,9 @@ export function inUnit(value, { factor }, digits = 3) {
   return Math.abs(counts) >= 1000 ? String(Math.round(counts)) : figure(counts, Math.max(digits, 4));
 }
 
+/** The numbers of a pixel with their unit. */
+export const valueIn = (value, unit) => `${value.map((one) => inUnit(one, unit, 4)).join(", ")} ${unit.words}`;
+
 /** A pixel value in the camera's counts, and as a multiple of the full scale. */
 export function inUnits(value, fullScale) {
   const share = `${figure(value)} × full scale`;

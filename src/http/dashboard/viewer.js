@@ -6,7 +6,7 @@ import { Pane } from "./pane.js";
 import { Player } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { axisOf, frameName, inUnit, unitOf } from "./format.js";
+import { axisOf, frameName, unitOf, valueIn } from "./format.js";
 import { get, isUnreachable } from "./api.js";
 import { Probe } from "./probe.js";
 import { sampled } from "./values.js";
@@ -62,7 +62,7 @@ export class Viewer {
     const stack = () => ({ base: this.base(), height, width, version: this.right.generation });
     const picture = () => this.ready && { ...stack(), height: this.view.height, width: this.view.width, base: this.source(this.player.frame).base };
     this.probe = new Probe(this.right, axisOf(job), { picture, stack, called: () => capital(frameName(job, this.player.frame)), unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
-    for (const pane of [this.left, this.right]) pane.describe = (value) => this.words(value);
+    for (const pane of [this.left, this.right]) pane.describe = (value) => valueIn(value, this.unit());
     const keys = h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
       h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`));
     this.controls = [this.player.element, this.rightContrast.element, this.right.tools, this.probe.element, this.slicing, keys];
@@ -90,12 +90,6 @@ export class Viewer {
   /** Factor and words of the unit of values. */
   unit() {
     return unitOf(this.fullScale);
-  }
-
-  /** A value in the user's units. */
-  words(value) {
-    const unit = this.unit();
-    return `${value.map((one) => inUnit(one, unit, 4)).join(", ")} ${unit.words}`;
   }
 
   /** Sets the stored number that means 1. */
