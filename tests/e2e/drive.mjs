@@ -86,6 +86,9 @@ export async function submit(page, checks, scene, small) {
     await page.press(field, "Tab");
     await page.waitForSelector(".estimate dd");
   }
+  await page.setViewportSize({ width: 390, height: 844 });
+  const finish = await page.$$eval(".finish dd, .finish button", (parts) => parts.map((part) => part.getBoundingClientRect().bottom));
+  checks.that(finish.length === 5 && Math.max(...finish) < 844, `a phone shows cost and button: ${finish}`);
   await checks.look(page, "submit");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
