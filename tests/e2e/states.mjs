@@ -100,6 +100,7 @@ async function doubted(page, checks, service) {
   const made = await (await page.waitForSelector("section[aria-label='How it was made']:has-text('Full scale')")).textContent();
   checks.that(/Full scale1000 counts: /.test(made) && /White level[\d.]+ counts \([\d.]+ × full scale\)/.test(made), `each number has its unit: ${made}`);
   await checks.text(page, ".verdictcard .findings", (text) => /coded aperture/.test(text), "the remedy says how to record the dark");
+  await checks.text(page, ".verdictcard .findings", (text) => text.includes("“Dark captures”"), "a remedy has the names of the form");
   await checks.look(page, "no-dark");
 }
 

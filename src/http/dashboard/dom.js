@@ -70,15 +70,22 @@ export function facts(pairs) {
   return h("dl", { class: "facts" }, rows.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]));
 }
 
-/** A SHA-256, of which the first digits are enough to recognise it. */
-const HASH = /\b([0-9a-f]{8})[0-9a-f]{56}\b/g;
+/** The names of settings in the texts of the service, as the form for a new job calls them. */
+const SETTINGS = {
+  dark: "Dark captures", saturation: "Saturated from", crop: "Window", array: "Array", frames: "First mask, Last mask", axes: "Order of the axes",
+  full_scale: "Full scale", registration: "Masks that have moved are", "registration auto": "Masks that have moved are corrected if it helps",
+};
 
-/** A text of the service with a capital and short hashes. */
-export const capital = (text) => String(text).replace(HASH, "$1…").replace(/^./, (letter) => letter.toUpperCase());
+/** A text of the service with the first digits of each SHA-256, and sizes such as 64 × 64 × 4. */
+const brief = (text) => String(text).replace(/\b([0-9a-f]{8})[0-9a-f]{56}\b/g, "$1…").replace(/\b[1-9]\d*(x\d+)+\b/g, (size) => size.replaceAll("x", " × "));
 
-/** A text of the service, with the names in backticks as code. */
+/** A text of the service with a capital. */
+export const capital = (text) => brief(text).replace(/^./, (letter) => letter.toUpperCase());
+
+/** A text of the service. Names in backticks become those of the form, or code. */
 export function marked(text) {
-  return String(text).replace(HASH, "$1…").split(/`([^`]+)`/).map((part, index) => (index % 2 ? h("code", null, part) : part));
+  const word = (name) => (SETTINGS[name] ? `“${SETTINGS[name]}”` : h("code", null, name));
+  return brief(text).replace("`registration` auto", "`registration auto`").split(/`([^`]+)`/).map((part, index) => (index % 2 ? word(part) : part));
 }
 
 /** An error's text, with a link to the page that explains it. */

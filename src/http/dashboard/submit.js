@@ -223,7 +223,7 @@ function measurementStep(form, changed, signal) {
   const wait = h("p", { class: "muted" }, "Select or create the calibration first.");
   const name = textField("measurement-name", "Name of the measurement", "shot 12");
   const [fps, exposure] = [numberField("fps", "Snapshots per second"), numberField("exposure", "Exposure in s")];
-  const saturation = numberField("saturation", "Saturated from (stored number)", 1);
+  const saturation = numberField("saturation", "Saturated from", 1);
   const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
   const darks = [];
   const darkList = h("p", { class: "muted" });
