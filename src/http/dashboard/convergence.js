@@ -1,6 +1,6 @@
 // Convergence plot: residual, change and sigma by iteration, on a logarithmic scale.
 
-import { figure } from "./format.js";
+import { figure, powerOfTen } from "./format.js";
 import { h, put, s } from "./dom.js";
 
 const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [220, 46, 12, 10, 26];
@@ -41,7 +41,7 @@ function grid(from, to, y, width) {
   for (let power = from; power <= to; power += step) {
     const at = y(10 ** power);
     lines.push(s("line", { x1: LEFT, x2: width - RIGHT, y1: at, y2: at, class: "grid" }));
-    lines.push(s("text", { x: LEFT - 6, y: at + 4, "text-anchor": "end" }, `1e${power}`));
+    lines.push(s("text", { x: LEFT - 6, y: at + 4, "text-anchor": "end" }, powerOfTen(power)));
   }
   return lines;
 }
