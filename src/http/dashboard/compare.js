@@ -14,7 +14,7 @@ import { sampled } from "./values.js";
 export async function compare(root, [path], signal) {
   const ids = path.split("/");
   const jobs = await Promise.all(ids.map((id) => get(`/v1/jobs/${id}`, signal)));
-  root.append(h("h1", null, `${jobs.length} jobs compared`));
+  root.append(h("p", { class: "back" }, h("a", { href: "#/jobs" }, "← All jobs")), h("h1", null, `${jobs.length} jobs compared`));
   const same = ["frames", "height", "width"].every((axis) => jobs.every((job) => job.shape[axis] === jobs[0].shape[axis]));
   const manifests = await Promise.all(jobs.map((job) => manifest(job, signal)));
   const all = manifests.every(Boolean);

@@ -79,7 +79,7 @@ function missing(title, reason) {
 /** Marks the menu entry of the current view. */
 function mark(path) {
   for (const entry of document.querySelectorAll("#nav a")) {
-    const here = path.startsWith(entry.getAttribute("href").slice(1));
+    const here = path.replace(/^\/compare\b/, "/jobs").startsWith(entry.getAttribute("href").slice(1));
     if (here) {
       entry.setAttribute("aria-current", "page");
       // On a phone, the menu may be wider than the screen.

@@ -209,7 +209,7 @@ function accepted(item, signal) {
       [item.dispersion ? "Masks of bands" : "Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
-      ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them`) : "none"],
+      ["Dead pixels", dead > 0 ? `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them` : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
       ["Grade", [grade(item.id, signal), " ", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "Report (new tab)")]],
     ]),

@@ -1,7 +1,7 @@
 // State of the service: what an administrator looks for first, in words.
 
 import { capital, facts, h, marked, put } from "./dom.js";
-import { bytes, duration, moment, momentInFull, nameOf, short } from "./format.js";
+import { bytes, duration, moment, momentInFull, nameOf, short, stateWord } from "./format.js";
 import { every } from "./live.js";
 import { get } from "./api.js";
 
@@ -27,7 +27,7 @@ const count = (number, one, many = `${one}s`) => `${number === 0 ? "no" : number
 /** The state in one sentence. */
 function summary({ jobs, workers: { length: alive }, disk: { free_bytes: free } }) {
   const [running, queued] = [jobs.running + jobs.cancelling, jobs.queued];
-  const work = running + queued === 0 ? "No job runs or waits" : `${count(running, "job")} running, ${queued || "none"} waiting`;
+  const work = running + queued === 0 ? "No job is running or queued" : `${count(running, "job")} running, ${queued || "none"} queued`;
   return `${capital(work)}; ${count(alive, "worker")} ready; ${bytes(free)} free.`;
 }
 
@@ -47,13 +47,13 @@ function service(found) {
   ]));
 }
 
-const STATES = [["running", "Running"], ["queued", "Waiting"], ["cancelling", "Stopping"], ["succeeded", "Finished"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
+const STATES = ["running", "queued", "cancelling", "succeeded", "failed", "cancelled"];
 
 function queue(found) {
-  const jobs = ([state, word]) => [word, found.jobs[state] === 0 ? "none" : h("a", { href: `#/jobs?state=${state}` }, count(found.jobs[state], "job"))];
+  const jobs = (state) => [capital(stateWord(state)), found.jobs[state] === 0 ? "none" : h("a", { href: `#/jobs?state=${state}` }, count(found.jobs[state], "job"))];
   const { running, ready, blocked } = found.queue;
   const open = ["running", "queued", "cancelling"];
-  return card("Queue", facts(STATES.filter(([state]) => state !== "cancelling" || found.jobs[state] > 0).map(jobs)),
+  return card("Queue", facts(STATES.filter((state) => state !== "cancelling" || found.jobs[state] > 0).map(jobs)),
     h("p", { class: "muted" }, open.some((state) => found.jobs[state] > 0) || running + ready + blocked > 0
       ? `Tasks: ${running} running, ${ready} ready for a worker, ${blocked} waiting for others.` : "No tasks are open."));
 }

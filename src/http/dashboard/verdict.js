@@ -141,7 +141,7 @@ export class Verdict {
     const rows = found.frames.map((frame) => [frame.frame, frame.psnr ?? "inf", frame.ssim ?? ""]);
     put(this.measured, h("p", { class: "quality" }, h("b", null, decibels(found.psnr)), " PSNR measured", found.ssim !== null && [", ", h("span", { class: "together" }, h("b", null, figure(found.ssim, 3)), " SSIM")]),
       h("p", { class: "muted" }, `Against the true frames of this job; mean of ${found.frames.length} ${spectral ? "bands" : "frames"}, relative to the white level, ${inUnits(found.peak, this.fullScale)}.`),
-      h("details", { open: true }, h("summary", null, spectral ? "PSNR band by band" : "PSNR frame by frame"),
+      h("details", { open: true }, h("summary", null, `PSNR in dB, ${spectral ? "band by band" : "frame by frame"}`),
         curve.length > 1 && curve.every(Number.isFinite) && plot(curve, { xName, xs, yName: "PSNR in dB", width: 270 }),
         h("div", { class: "row" }, csvLink(`${this.job.id.slice(-8)}_${this.snapshot}_quality.csv`, [spectral ? "band" : "frame", "psnr_db", "ssim"], rows))));
     return true;
