@@ -2,7 +2,7 @@
 
 import { announce, h, put, say } from "./dom.js";
 import { dropZone } from "./drop.js";
-import { shadeAlike, thumb } from "./thumb.js";
+import { shade, thumb } from "./thumb.js";
 
 const ROLES = [
   ["pattern", "Next pattern"],
@@ -64,7 +64,7 @@ export class Captures {
   }
 
   show() {
-    shadeAlike(this.items.map((item) => item.picture).filter(Boolean));
+    shade(this.items.map((item) => item.picture).filter(Boolean));
     let number = 0;
     put(this.list, this.items.map((item, index) => {
       if (item.role === "pattern") number += 1;

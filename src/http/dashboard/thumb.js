@@ -52,7 +52,7 @@ class Thumbnail {
   }
 
   /** Draws the values between black at `low` and white at `high`; grey if these are equal. */
-  shade(low, high) {
+  draw(low, high) {
     const { width, height } = this.canvas;
     const image = new ImageData(width, height);
     this.values.forEach((value, index) => image.data.set([0, 0, 0].map(() => (high > low ? (255 * (value - low)) / (high - low) : 128)).concat(255), 4 * index));
@@ -61,10 +61,10 @@ class Thumbnail {
 }
 
 /** Draws thumbnails with one range of values, so that a dark capture is darker than a bright one. */
-export function shadeAlike(thumbnails) {
+export function shade(thumbnails) {
   const low = Math.min(...thumbnails.map((one) => one.low));
   const high = Math.max(...thumbnails.map((one) => one.high));
-  thumbnails.forEach((one) => one.shade(low, high));
+  thumbnails.forEach((one) => one.draw(low, high));
 }
 
 function reader(bytes, offset, kind, little) {
