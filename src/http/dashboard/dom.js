@@ -76,8 +76,9 @@ const SETTINGS = {
   full_scale: "Full scale", registration: "Masks that have moved are", "registration auto": "Masks that have moved are corrected if it helps",
 };
 
-/** A text of the service with the first digits of each SHA-256, and sizes such as 64 × 64 × 4. */
-const brief = (text) => String(text).replace(/\b([0-9a-f]{8})[0-9a-f]{56}\b/g, "$1…").replace(/\b[1-9]\d*(x\d+)+\b/g, (size) => size.replaceAll("x", " × "));
+/** A text of the service with the first digits of each SHA-256, sizes such as 64 × 64 × 4, and numbers such as −2. */
+const brief = (text) => String(text).replace(/\b([0-9a-f]{8})[0-9a-f]{56}\b/g, "$1…")
+  .replace(/\b[1-9]\d*(x\d+)+\b/g, (size) => size.replaceAll("x", " × ")).replaceAll(" x ", " × ").replace(/(^|[ (])-(?=\d)/g, "$1−");
 
 /** A text of the service with a capital. */
 export const capital = (text) => brief(text).replace(/^./, (letter) => letter.toUpperCase());
