@@ -161,7 +161,7 @@ export async function access(browser, checks, program, services) {
   await page.waitForSelector("#who:has-text('viewing optics · admin')");
   await page.click("#who");
   await page.click("text=Back to your own lab");
-  await page.waitForSelector("#who:text-is('guests · admin')");
+  await page.waitForSelector("#who:has-text('guests · admin')");
   await page.context().close();
 }
 
