@@ -3,7 +3,7 @@
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
-import { Player } from "./player.js";
+import { Player, keysHelp } from "./player.js";
 import { View } from "./view.js";
 import { announce, explained, h, put, say } from "./dom.js";
 import { bytes, decibels, duration, expectedRange, figure, frameName, iterationsOf, nameOf, shapeOf, stateWord, unitOf, valueIn, wavelengthsOf } from "./format.js";
@@ -103,7 +103,7 @@ class Group {
       this.panels, this.player.element,
       h("div", { class: "row matching" }, h("label", { for: "match", class: "row" }, this.match, "Own contrast for each job"), this.scales),
       h("div", { class: `panes of${jobs.length} contrasts` }, this.contrasts.map((contrast) => contrast.element)),
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. Drag the line of the wipe, or use its slider.")));
+      keysHelp("Drag the line of the wipe, or use its slider."));
     this.player.keys(this.element);
     this.drag();
     signal.addEventListener("abort", () => clearTimeout(this.timer), { once: true });

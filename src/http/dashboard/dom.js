@@ -89,10 +89,12 @@ export function marked(text) {
   return brief(text).replace("`registration` auto", "`registration auto`").split(/`([^`]+)`/).map((part, index) => (index % 2 ? word(part) : part));
 }
 
+/** Link to the page that explains an error; false for unknown errors. */
+export const about = ({ code }) => code && code !== "unknown" && h("a", { href: `/problems/${code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)");
+
 /** An error's text, with a link to the page that explains it. */
 export function explained(error) {
-  const { code } = error;
-  const link = code && code !== "unknown" && h("a", { href: `/problems/${code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)");
+  const link = about(error);
   return [marked(error.message ?? error), link && [" ", link]];
 }
 

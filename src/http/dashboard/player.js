@@ -3,6 +3,10 @@
 import { figure } from "./format.js";
 import { h, put, say } from "./dom.js";
 
+/** The keys of a picture with a player, and further gestures. */
+export const keysHelp = (more) => h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
+  h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. ${more}`));
+
 /** Highest playback rate in frames per second, the refresh rate of fast screens. */
 const MAX_RATE = 240;
 

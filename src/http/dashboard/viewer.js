@@ -3,7 +3,7 @@
 import { capital, h, say } from "./dom.js";
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
-import { Player } from "./player.js";
+import { Player, keysHelp } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
 import { axisOf, frameName, unitOf, valueIn } from "./format.js";
@@ -63,8 +63,7 @@ export class Viewer {
     const picture = () => this.ready && { ...stack(), height: this.view.height, width: this.view.width, base: this.source(this.player.frame).base };
     this.probe = new Probe(this.right, axisOf(job), { picture, stack, called: () => capital(frameName(job, this.player.frame)), unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
     for (const pane of [this.left, this.right]) pane.describe = (value) => valueIn(value, this.unit());
-    const keys = h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
-      h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`));
+    const keys = keysHelp(`The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`);
     this.controls = [this.player.element, this.rightContrast.element, this.right.tools, this.probe.element, this.slicing, keys];
     this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.meaning, this.probe.element, this.slicing, keys);
     this.measured = null;
