@@ -146,20 +146,25 @@ function stored(known, wanted, use, signal) {
 }
 
 function masks(settings, use, verdict, signal) {
-  // The file that was dropped last, with the full scale, array and axes stated for it.
-  let last = null;
+  // The file that was dropped last, with the full scale, array and axes stated for it, and the number of the latest attempt.
+  let [last, attempt] = [null, 0];
   const repeat = () => last && make(...last).catch((error) => put(verdict, problem(error)));
   const part = partFields("masks-part", true, repeat);
   const make = async (sha256, stated) => {
+    attempt += 1;
+    const mine = attempt;
     last = [sha256, stated];
     use(null);
     put(verdict);
     try {
       const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...part.value(), ...stated }, signal);
+      // A later attempt has replaced this one.
+      if (mine !== attempt) return;
       const again = (full_scale) => make(sha256, { ...stated, full_scale }).catch((later) => put(verdict, problem(later)));
       put(verdict, accepted(item, signal), h("details", null, h("summary", null, `Full scale of the masks: ${exact(item.full_scale)}`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
     } catch (error) {
+      if (mine !== attempt) return;
       if (isAborted(error)) throw error;
       const again = (next) => make(sha256, next).catch((later) => put(verdict, problem(later)));
       put(verdict, problem(error), askAbout(error, sha256, stated, again, { frames: () => askFrames(error, part, repeat) }));
