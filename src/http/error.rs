@@ -121,7 +121,7 @@ codes! {
     Internal: StatusCode::INTERNAL_SERVER_ERROR, "Internal error", true,
         "The log of the service has the cause, under the identifier of the request.";
     TaskFailed: StatusCode::INTERNAL_SERVER_ERROR, "Task failed", true,
-        "Fix the cause in the detail, then retry the job.";
+        "Do what the detail says. If it names nothing that you can change, retry the job.";
     OutOfMemory: StatusCode::INTERNAL_SERVER_ERROR, "Worker ran out of memory", true,
         "Use smaller tiles, fewer workers or a machine with more memory, then retry the job.";
     WorkerCrashed: StatusCode::INTERNAL_SERVER_ERROR, "Worker crashed", true,

@@ -83,6 +83,8 @@ export class Checks {
       this.that(odd.length === 0, `${name} shows ${odd}`);
       const wider = await page.evaluate(() => Math.max(document.documentElement.scrollWidth - innerWidth, ...[...document.querySelectorAll("main, header")].map((part) => part.scrollWidth - part.clientWidth)));
       this.that(wider <= 0, `${name} is ${wider} pixels wider than a screen of ${width}`);
+      const longer = await page.evaluate(() => document.documentElement.scrollHeight - innerHeight);
+      this.that(longer <= 0, `only the content of ${name} scrolls, but the document is ${longer} pixels longer than the screen`);
     }
     await page.setViewportSize({ width: SIZES[0][0], height: SIZES[0][1] });
   }

@@ -86,6 +86,9 @@ export async function submit(page, checks, scene, small) {
     await page.press(field, "Tab");
     await page.waitForSelector(".estimate dd");
   }
+  await page.setViewportSize({ width: 390, height: 844 });
+  const finish = await page.$$eval(".finish dd, .finish button", (parts) => parts.map((part) => part.getBoundingClientRect().bottom));
+  checks.that(finish.length === 5 && Math.max(...finish) < 844, `a phone shows cost and button: ${finish}`);
   await checks.look(page, "submit");
   await page.click("button[type=submit]");
   await page.waitForURL(/#\/jobs\/[0-9a-f-]{36}$/);
@@ -653,7 +656,7 @@ export async function compare(page, checks, labels, truth) {
     slider.value = 200;
     slider.dispatchEvent(new Event("input"));
   });
-  checks.that(new Set(await windows()).size === 2, "with “Match scale” each job has its own contrast");
+  checks.that(new Set(await windows()).size === 2, "each job can have its own contrast");
   await page.uncheck("#match");
   const whole = await picture();
   await page.click("#wipe");
@@ -666,7 +669,21 @@ export async function compare(page, checks, labels, truth) {
   await page.mouse.up();
   await checks.until(async () => (await picture()) !== middle && (await page.inputValue("#wipe-at")) < 450, Boolean, "the wipe follows the pointer");
   await checks.look(page, "compare-wipe");
+  const values = async (x) => {
+    const { y } = await (await page.$(".sight canvas")).boundingBox();
+    const before = await page.textContent(".readout");
+    await page.mouse.move(x, y + 40);
+    const text = await checks.until(() => page.textContent(".readout"), (text) => text !== before && /^Row \d+, column \d+: .* × full scale$/.test(text), "the value of a pixel has a unit");
+    // Powers of ten follow values below 0.001.
+    return text.replaceAll(/ × 10[⁰¹²³⁴-⁹⁻]+/g, "e-4").match(/: .*/)[0].match(/−?\d[\de.-]*/g).map((value) => Number(value.replace("−", "-")));
+  };
+  const line = await (await page.$(".handle")).boundingBox();
+  const [left, right] = [await values(line.x - 8), await values(line.x + 40)];
+  checks.that(left.length === 1 && right.length === 1, `each side of the wipe has one value: ${left}, ${right}`);
   await shows(page, checks, 0, () => page.click("#difference"), "the difference shows something");
+  const [first, second, difference] = await values(line.x + 40);
+  checks.that(second === right[0] && Math.abs(first - second - difference) < 2e-3, `right of the wipe is the second job's value, and a difference has both: ${[right, first, second, difference]}`);
+  await checks.text(page, ".pane figcaption span", (title) => title.startsWith("4 × |"), "the title of a difference has its factor");
   await checks.look(page, "compare-difference");
   await page.click("#flicker");
   await page.fill("#flicker-rate", "10");
@@ -756,6 +773,8 @@ export async function captures(page, checks, scene) {
   await page.setInputFiles("#captures", [file("black.npy", black)]);
   await page.waitForSelector(`text=${patterns.length} patterns. Check their order`);
   checks.that((await page.$$(".capture canvas")).length === patterns.length + 2, "each capture has a thumbnail");
+  const shades = await page.$$eval(".capture canvas", (all) => all.slice(-2).map((canvas) => canvas.getContext("2d").getImageData(0, 0, 1, 1).data[0]));
+  checks.that(Math.min(...shades) < 20 && Math.max(...shades) > 200, `white and black captures look white and black: ${shades}`);
   const order = () => page.$$eval(".capture .filename", (lines) => lines.slice(0, 2).map((line) => line.textContent));
   checks.that((await order()).join() === "pattern-1.npy,pattern-2.npy", `captures are sorted by name: ${await order()}`);
   await page.dragAndDrop(".capture:nth-child(1) .filename", ".capture:nth-child(2) .filename");

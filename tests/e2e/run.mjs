@@ -100,7 +100,7 @@ async function views(page, service) {
   await checks.look(page, "jobs");
   await page.goto(`${service.url}/#/system`);
   await page.waitForSelector("table");
-  await checks.text(page, ".lead", (lead) => /^(No job runs or waits|\d+ jobs? running, (none|\d+) waiting); 2 workers ready; [\d.]+ [KMGT]iB free\.$/.test(lead), "the state is one sentence");
+  await checks.text(page, ".lead", (lead) => /^(No job is running or queued|(no jobs|\d+ jobs?) running, (none|\d+) queued); 2 workers ready; [\d.]+ [KMGT]iB free\.$/.test(lead), "the state is one sentence");
   await checks.look(page, "system");
   await page.goto(`${service.url}/#/calibrations`);
   await page.click(".calibration >> nth=0");

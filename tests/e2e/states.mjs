@@ -50,6 +50,11 @@ export async function faults(browser, checks, program, services) {
   await service.when(failed.id, (job) => job.state === "failed");
   await page.goto(`${service.url}/#/jobs/${failed.id}`);
   await page.waitForSelector(".onpicture:has-text('Failed')");
+  const reason = await page.textContent("#content .trouble");
+  checks.that(/^Preparing: the stored /.test(reason) && !/[0-9a-f]{64}/.test(reason) && reason.includes("Do what the detail says"), `the reason and the remedy agree: ${reason}`);
+  checks.that((await page.$(".trouble a[href='#/new']")) !== null, "damaged inputs lead to a new job");
+  const useless = [".verdictcard > p:last-child", ".verdictcard .findings", "#mode", ".probe", ".slicing"];
+  await checks.until(() => Promise.all(useless.map((place) => page.isVisible(place))), (seen) => !seen.some(Boolean), "a job without frames has neither grade nor controls");
   await checks.look(page, "failed");
   await page.goto(`${service.url}/#/jobs`);
   await page.waitForSelector(".badge.failed");
@@ -95,6 +100,7 @@ async function doubted(page, checks, service) {
   const made = await (await page.waitForSelector("section[aria-label='How it was made']:has-text('Full scale')")).textContent();
   checks.that(/Full scale1000 counts: /.test(made) && /White level[\d.]+ counts \([\d.]+ × full scale\)/.test(made), `each number has its unit: ${made}`);
   await checks.text(page, ".verdictcard .findings", (text) => /coded aperture/.test(text), "the remedy says how to record the dark");
+  await checks.text(page, ".verdictcard .findings", (text) => text.includes("“Dark captures”"), "a remedy has the names of the form");
   await checks.look(page, "no-dark");
 }
 
@@ -155,7 +161,7 @@ export async function access(browser, checks, program, services) {
   await page.waitForSelector("#who:has-text('viewing optics · admin')");
   await page.click("#who");
   await page.click("text=Back to your own lab");
-  await page.waitForSelector("#who:text-is('guests · admin')");
+  await page.waitForSelector("#who:has-text('guests · admin')");
   await page.context().close();
 }
 

@@ -2,7 +2,7 @@
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
-import { Player } from "./player.js";
+import { Player, keysHelp } from "./player.js";
 import { View } from "./view.js";
 import { announce, explained, facts, h, place, put, trouble } from "./dom.js";
 import { ask, rename, showMessage } from "./actions.js";
@@ -147,7 +147,7 @@ class Masks {
     });
     this.pane.tools.append(this.choice, h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit"));
     this.element = h("section", { class: "card viewer", "aria-label": "Masks" }, this.pane.element, this.player.element, this.contrast.element,
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on the picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves.")));
+      keysHelp("The wheel zooms; dragging moves."));
     this.player.keys(this.element);
   }
 

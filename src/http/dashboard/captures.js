@@ -2,7 +2,7 @@
 
 import { announce, h, put, say } from "./dom.js";
 import { dropZone } from "./drop.js";
-import { thumb } from "./thumb.js";
+import { shade, thumb } from "./thumb.js";
 
 const ROLES = [
   ["pattern", "Next pattern"],
@@ -64,6 +64,7 @@ export class Captures {
   }
 
   show() {
+    shade(this.items.map((item) => item.picture).filter(Boolean));
     let number = 0;
     put(this.list, this.items.map((item, index) => {
       if (item.role === "pattern") number += 1;
@@ -81,7 +82,7 @@ export class Captures {
     } }, ROLES.map(([value, text]) => h("option", { value, selected: value === item.role }, text)));
     const move = (by, label, sign) => h("button", { type: "button", class: "small", "aria-label": `${label}: ${item.name}`, disabled: !this.items[index + by], onclick: () => this.move(index, index + by) }, sign);
     const element = h("li", { draggable: "true", class: `capture ${item.role}` },
-      h("span", { class: "number" }, number ?? ""), item.picture ?? h("span", { class: "blank" }), h("span", { class: "filename" }, item.name), role,
+      h("span", { class: "number" }, number ?? ""), item.picture?.canvas ?? h("span", { class: "blank" }), h("span", { class: "filename" }, item.name), role,
       h("span", { class: "row" }, move(-1, "Up", "↑"), move(1, "Down", "↓"), h("button", { type: "button", class: "small", "aria-label": `Remove ${item.name}`, onclick: () => {
         this.items.splice(index, 1);
         this.show();

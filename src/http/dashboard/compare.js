@@ -3,10 +3,10 @@
 
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
-import { Player } from "./player.js";
+import { Player, keysHelp } from "./player.js";
 import { View } from "./view.js";
 import { announce, explained, h, put, say } from "./dom.js";
-import { bytes, decibels, duration, expectedRange, figure, frameName, iterationsOf, nameOf, shapeOf, stateWord, wavelengthsOf } from "./format.js";
+import { bytes, decibels, duration, expectedRange, figure, frameName, iterationsOf, nameOf, shapeOf, stateWord, unitOf, valueIn, wavelengthsOf } from "./format.js";
 import { isAborted, get, send, upload } from "./api.js";
 import { networks, ran } from "./provenance.js";
 import { sampled } from "./values.js";
@@ -14,7 +14,7 @@ import { sampled } from "./values.js";
 export async function compare(root, [path], signal) {
   const ids = path.split("/");
   const jobs = await Promise.all(ids.map((id) => get(`/v1/jobs/${id}`, signal)));
-  root.append(h("h1", null, `${jobs.length} jobs compared`));
+  root.append(h("p", { class: "back" }, h("a", { href: "#/jobs" }, "← All jobs")), h("h1", null, `${jobs.length} jobs compared`));
   const same = ["frames", "height", "width"].every((axis) => jobs.every((job) => job.shape[axis] === jobs[0].shape[axis]));
   const manifests = await Promise.all(jobs.map((job) => manifest(job, signal)));
   const all = manifests.every(Boolean);
@@ -101,9 +101,9 @@ class Group {
       h("div", { class: "row", role: "group", "aria-label": "Mode of comparison" }, this.modes, this.pairing, this.wipe, this.gain, this.rateLabel,
         h("span", { class: "grow" }), h("button", { type: "button", class: "small", onclick: () => this.view.fit() }, "Fit")),
       this.panels, this.player.element,
-      h("div", { class: "row matching" }, h("label", { for: "match", class: "row" }, this.match, "Match scale"), this.scales),
+      h("div", { class: "row matching" }, h("label", { for: "match", class: "row" }, this.match, "Own contrast for each job"), this.scales),
       h("div", { class: `panes of${jobs.length} contrasts` }, this.contrasts.map((contrast) => contrast.element)),
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"), h("p", { class: "muted" }, "Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. Drag the line of the wipe, or use its slider.")));
+      keysHelp("Drag the line of the wipe, or use its slider."));
     this.player.keys(this.element);
     this.drag();
     signal.addEventListener("abort", () => clearTimeout(this.timer), { once: true });
@@ -145,23 +145,31 @@ class Group {
 
   async open() {
     const middle = Math.ceil(this.player.count / 2);
-    const spreads = await Promise.all(this.jobs.map((_, index) => get(`${this.base(index, middle)}/spread`, this.signal)));
+    const [spreads, unit] = await Promise.all([Promise.all(this.jobs.map((_, index) => get(`${this.base(index, middle)}/spread`, this.signal))), this.unit()]);
     this.spreads = spreads;
+    for (const contrast of this.contrasts) contrast.measure(unit);
+    for (const pane of this.panes) pane.describe = (value) => valueIn(value, unit);
     // A job with another scale would be black next to the others, or white.
     const whites = spreads.map(({ high }) => Math.max(high, 1e-9));
-    const ratio = Math.max(...whites) / Math.min(...whites);
-    this.match.checked = ratio > MAX_RATIO;
-    say(this.scales, ratio > MAX_RATIO
-      ? `The brightest frames are ${figure(ratio, 2)} times as bright as the darkest. With “Match scale” each job is shown on its own scale.`
-      : "Off: all jobs share one contrast, so that differences in brightness are visible. On: each job has its own.");
+    this.ratio = Math.max(...whites) / Math.min(...whites);
+    this.match.checked = this.ratio > MAX_RATIO;
     spreads.forEach((spread, index) => sampled({ base: this.base(index, middle), ...spread }).then((values) => this.contrasts[index].distribution(values)).catch(() => {}));
     this.rescale();
     this.choose("beside");
   }
 
+  /** The unit of all values: counts, if the measurements have one full scale. */
+  async unit() {
+    const measurements = await Promise.all(this.jobs.map(({ measurement }) => get(`/v1/measurements/${measurement}`, this.signal)));
+    const scales = new Set(measurements.map(({ full_scale: scale }) => scale));
+    return unitOf(scales.size === 1 ? [...scales][0] : 1);
+  }
+
   /** Gives each job its own contrast, or all the same one. */
   rescale() {
-    const { spreads } = this;
+    const { spreads, ratio } = this;
+    say(this.scales, !this.match.checked ? "All jobs share one contrast, so that differences in brightness are visible."
+      : ratio > MAX_RATIO ? `The brightest frames are ${figure(ratio, 2)} times as bright as the darkest.` : "Differences in brightness between the jobs are not visible.");
     const least = (name) => Math.min(...spreads.map((spread) => spread[name]));
     const most = (name) => Math.max(...spreads.map((spread) => spread[name]));
     const shared = { low: least("low"), high: most("high") };
@@ -227,7 +235,7 @@ class Group {
       say(first.title, `${this.titleOf(one)} | ${this.titleOf(other)}`);
     } else if (this.mode === "difference") {
       first.lay({ source: over, gain: Number(this.gain.value) });
-      say(first.title, `|${this.titleOf(one)} − ${this.titleOf(other)}|`);
+      say(first.title, `${this.gain.value} × |${this.titleOf(one)} − ${this.titleOf(other)}|`);
     } else {
       first.lay(null);
       say(first.title, this.titleOf(shown));

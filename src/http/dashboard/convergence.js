@@ -1,12 +1,15 @@
 // Convergence plot: residual, change and sigma by iteration, on a logarithmic scale.
 
-import { figure } from "./format.js";
+import { figure, powerOfTen } from "./format.js";
 import { h, put, s } from "./dom.js";
 
 const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [220, 46, 12, 10, 26];
 /** Widths of the plot in pixels; its text keeps its size on a phone. */
 const [LEAST_WIDTH, MOST_WIDTH] = [280, 560];
-const LINES = [["residual", 1, "residual ‖y − Hx‖ / ‖y‖"], ["change", 2, "change ‖v − v₋‖ / ‖v‖"], ["sigma", 3, "sigma of the denoiser"]];
+const LINES = [["residual", 1, "residual ‖y − Hw‖ / ‖y‖ before the projection"], ["change", 2, "change ‖v − v₋‖ / ‖v‖"], ["sigma", 3, "sigma of the denoiser"]];
+
+/** Why the residual of a tile in the plot differs from that of its frames. */
+const INSIDE = "This residual is that of w, the extrapolated frames from which an iteration starts. It is usually larger than that of the result x under “How it was made”, which is not extrapolated.";
 
 /** Draws `points` ([iteration, residual, change, sigma], ...) into an element. */
 export function convergence(element, points) {
@@ -23,13 +26,13 @@ export function convergence(element, points) {
   const x = (iteration) => LEFT + ((width - LEFT - RIGHT) * (iteration - first)) / span;
   const y = (value) => TOP + ((HEIGHT - TOP - BOTTOM) * (to - Math.log10(Math.max(value, 10 ** from)))) / (to - from);
   const last = points.at(-1);
-  const summary = `After ${last[0]} iterations the residual is ${figure(last[1])}, the change ${figure(last[2])}${last[3] === null ? "" : `, sigma ${figure(last[3])}`}.`;
+  const summary = `In iteration ${last[0]} the residual before the projection is ${figure(last[1])}, the change ${figure(last[2])}${last[3] === null ? "" : `, sigma ${figure(last[3])}`}.`;
   put(element,
     s("svg", { viewBox: `0 0 ${width} ${HEIGHT}`, class: "plot", role: "img", "aria-label": summary },
       grid(from, to, y, width), ticks(first, span, x),
       LINES.map(([name, index]) => line(name, points.filter((point) => point[index] !== null), (point) => [x(point[0]), y(point[index])]))),
     h("p", { class: "legend" }, LINES.filter(([, index]) => points.some((point) => point[index] !== null)).map(([name, , title]) => h("span", null, h("span", { class: `key ${name}` }), title))),
-    h("p", { class: "muted" }, summary));
+    h("p", { class: "muted" }, `${summary} ${INSIDE}`));
 }
 
 function grid(from, to, y, width) {
@@ -38,7 +41,7 @@ function grid(from, to, y, width) {
   for (let power = from; power <= to; power += step) {
     const at = y(10 ** power);
     lines.push(s("line", { x1: LEFT, x2: width - RIGHT, y1: at, y2: at, class: "grid" }));
-    lines.push(s("text", { x: LEFT - 6, y: at + 4, "text-anchor": "end" }, `1e${power}`));
+    lines.push(s("text", { x: LEFT - 6, y: at + 4, "text-anchor": "end" }, powerOfTen(power)));
   }
   return lines;
 }

@@ -70,15 +70,31 @@ export function facts(pairs) {
   return h("dl", { class: "facts" }, rows.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]));
 }
 
-/** A text of the service, with the names in backticks as code. */
+/** The names of settings in the texts of the service, as the form for a new job calls them. */
+const SETTINGS = {
+  dark: "Dark captures", saturation: "Saturated from", crop: "Window", array: "Array", frames: "First mask, Last mask", axes: "Order of the axes",
+  full_scale: "Full scale", registration: "Masks that have moved are", "registration auto": "Masks that have moved are corrected if it helps",
+};
+
+/** A text of the service with the first digits of each SHA-256, sizes such as 64 × 64 × 4, and numbers such as −2. */
+const brief = (text) => String(text).replace(/\b([0-9a-f]{8})[0-9a-f]{56}\b/g, "$1…")
+  .replace(/\b[1-9]\d*(x\d+)+\b/g, (size) => size.replaceAll("x", " × ")).replaceAll(" x ", " × ").replace(/(^|[ (])-(?=\d)/g, "$1−");
+
+/** A text of the service with a capital. */
+export const capital = (text) => brief(text).replace(/^./, (letter) => letter.toUpperCase());
+
+/** A text of the service. Names in backticks become those of the form, or code. */
 export function marked(text) {
-  return String(text).split(/`([^`]+)`/).map((part, index) => (index % 2 ? h("code", null, part) : part));
+  const word = (name) => (SETTINGS[name] ? `“${SETTINGS[name]}”` : h("code", null, name));
+  return brief(text).replace("`registration` auto", "`registration auto`").split(/`([^`]+)`/).map((part, index) => (index % 2 ? word(part) : part));
 }
+
+/** Link to the page that explains an error; false for unknown errors. */
+export const about = ({ code }) => code && code !== "unknown" && h("a", { href: `/problems/${code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)");
 
 /** An error's text, with a link to the page that explains it. */
 export function explained(error) {
-  const { code } = error;
-  const link = code && code !== "unknown" && h("a", { href: `/problems/${code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)");
+  const link = about(error);
   return [marked(error.message ?? error), link && [" ", link]];
 }
 

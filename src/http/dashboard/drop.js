@@ -2,7 +2,7 @@
 
 import { bytes } from "./format.js";
 import { isAborted, upload } from "./api.js";
-import { h, marked, put, say } from "./dom.js";
+import { about, h, marked, put, say } from "./dom.js";
 
 /**
  * Creates a drop zone. Each file is uploaded and passed to `take(blob, file)` with the record of the blob. With
@@ -67,9 +67,9 @@ export function dropZone(id, title, hint, signal, take, many = false) {
 }
 
 /** An error message with all invalid fields. */
-export function problem(error, about = null) {
+export function problem(error, file = null) {
   const errors = error.errors ?? [];
   const list = errors.length > 1 ? h("ul", null, errors.map((item) => h("li", null, `${item.pointer}: `, marked(item.detail)))) : null;
-  return h("div", { class: "trouble", role: "alert" }, h("b", null, about ? `${about}: ` : "Rejected: "), errors.length > 1 ? null : marked(error.message), list,
-    error.code && error.code !== "unknown" && h("p", null, h("a", { href: `/problems/${error.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
+  return h("div", { class: "trouble", role: "alert" }, h("b", null, file ? `${file}: ` : "Rejected: "), errors.length > 1 ? null : marked(error.message), list,
+    h("p", null, about(error)));
 }

@@ -1,11 +1,11 @@
 // Filter of the job list by state and text, stored in the URL, and saved filters.
 
-import { calmly, h, put } from "./dom.js";
+import { calmly, capital, h, put } from "./dom.js";
 import { recall, remember } from "./storage.js";
 import { stateWord } from "./format.js";
 
 const STATES = ["queued", "running", "succeeded", "failed", "cancelling", "cancelled"];
-const CHOICES = [["", "All states"], ["queued,running", "Active"], ...STATES.map((state) => [state, stateWord(state)[0].toUpperCase() + stateWord(state).slice(1)])];
+const CHOICES = [["", "All states"], ["queued,running", "Active"], ...STATES.map((state) => [state, capital(stateWord(state))])];
 
 /** The filter's fields; `changed()` is called when the filter changes. */
 export function filters(query, changed) {

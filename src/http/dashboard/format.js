@@ -1,7 +1,7 @@
 // Formats numbers, times and states for display.
 
 /** An expected PSNR; the model does not distinguish values above 40 dB. */
-export const aboutDecibels = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(0)} dB`);
+export const aboutDecibels = (psnr) => (psnr >= 40 ? "40 dB or more" : `${psnr.toFixed(1)} dB`);
 
 /** The interval of an assessment's expected PSNR, or a dash where there is no figure. */
 export function expectedRange(assessment) {
@@ -21,7 +21,7 @@ export function roughly(seconds) {
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";
   const whole = Math.max(0, Math.round(seconds));
-  if (whole === 0) return "less than 1 s";
+  if (whole === 0) return "< 1 s";
   if (whole < 60) return `${whole} s`;
   const pair = (large, one, small, other) => `${large} ${one}${small > 0 ? ` ${small} ${other}` : ""}`;
   if (whole < 3600) return pair(Math.floor(whole / 60), "min", whole % 60, "s");
@@ -56,16 +56,22 @@ export function momentInFull(text) {
   return text ? full.format(new Date(text)) : "–";
 }
 
+/** "10⁻⁵" for -5. */
+export const powerOfTen = (power) => `10${String(power).replace(/./g, (sign) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[sign] ?? "⁻")}`;
+
+/** A number's text as in print: "-3.75e-5" -> "−3.75 × 10⁻⁵". */
+const printed = (text) => String(text).replace("-", "−").replace(/e\+?(.*)$/, (_, power) => ` × ${powerOfTen(power.replace("−", "-"))}`);
+
 /** A number with `digits` significant digits. */
 export function figure(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (value !== 0 && (Math.abs(value) < 1e-3 || Math.abs(value) >= 1e5)) return value.toExponential(digits - 1);
-  return String(Number(value.toPrecision(digits)));
+  if (value !== 0 && (Math.abs(value) < 1e-3 || Math.abs(value) >= 1e5)) return printed(value.toExponential(digits - 1));
+  return printed(Number(value.toPrecision(digits)));
 }
 
 /** A number that somebody stated, with all digits of its single precision. */
 export function exact(value) {
-  return value === null || value === undefined ? "–" : String(Number(value.toPrecision(7)));
+  return value === null || value === undefined ? "–" : printed(Number(value.toPrecision(7)));
 }
 
 /** Last 8 characters of an identifier; they differ even between resources created at the same time. */
@@ -114,8 +120,11 @@ export const unitOf = (fullScale) => ({ factor: fullScale, words: fullScale === 
 export function inUnit(value, { factor }, digits = 3) {
   const counts = value * factor;
   if (factor === 1 || !Number.isFinite(counts)) return figure(value, digits);
-  return Math.abs(counts) >= 1000 ? String(Math.round(counts)) : figure(counts, Math.max(digits, 4));
+  return Math.abs(counts) >= 1000 ? printed(Math.round(counts)) : figure(counts, Math.max(digits, 4));
 }
+
+/** The numbers of a pixel with their unit. */
+export const valueIn = (value, unit) => `${value.map((one) => inUnit(one, unit, 4)).join(", ")} ${unit.words}`;
 
 /** A pixel value in the camera's counts, and as a multiple of the full scale. */
 export function inUnits(value, fullScale) {
@@ -175,7 +184,7 @@ export function verdictOf(job, { verdict, assessment } = job) {
   const isWrong = findingsOf(job, assessment).some(({ severity }) => severity === "error");
   if (verdict === "bad" && isWrong) return [verdict, verdict, "Bad", "The checks found errors that make the frames wrong:"];
   if (verdict === "doubtful") return [verdict, verdict, "Doubtful", "The checks put the scale, the dark or the masks in doubt, and with them the frames:"];
-  return [verdict, verdict, `Likely ${verdict}`, `${limitOf(verdict, assessment)} ${LIKE[verdict]}`];
+  return [verdict, verdict, `Likely ${verdict}`, `${limitOf(verdict, assessment)} ${LOOK[verdict === "good" ? measuredVerdict(assessment.psnr_db)[1] : verdict]}`];
 }
 
 /** Expected PSNR in dB from which frames are good, and the upper end of the interval below which they are bad, as in the service. */
@@ -189,12 +198,15 @@ function limitOf(verdict, { psnr_db: psnr, psnr_high_db: high, reasons }) {
   return reasons.some(({ code }) => code !== "uneven_error") ? "The finding below limits the verdict." : "The verdict is that of the worst snapshot.";
 }
 
+/** The look of frames of a range of the PSNR. */
+const LOOK = { excellent: "Errors are hard to see.", good: "Detail is softened.", usable: "Texture is lost.", bad: "Only coarse shapes are correct." };
+
 /** Verdicts on a measured PSNR: kind, word, title, reason, and the lower limit in dB, in descending order. */
 const LEVELS = [
-  ["good", "excellent", "Excellent", "35 dB or more: errors are hard to see.", 35],
-  ["good", "good", "Good", "28 to 35 dB: expect softened detail.", 28],
-  ["usable", "usable", "Usable", "22 to 28 dB: expect lost texture.", 22],
-  ["bad", "bad", "Bad", "Less than 22 dB: expect only coarse shapes.", -Infinity],
+  ["good", "excellent", "Excellent", `35 dB or more. ${LOOK.excellent}`, 35],
+  ["good", "good", "Good", `28 to 35 dB. ${LOOK.good}`, GOOD_DB],
+  ["usable", "usable", "Usable", `22 to 28 dB. ${LOOK.usable}`, BAD_DB],
+  ["bad", "bad", "Bad", `Less than 22 dB. ${LOOK.bad}`, -Infinity],
 ];
 
 /** The verdict on a PSNR against true frames, as `verdictOf`; null means that the frames are identical. */
@@ -205,13 +217,6 @@ export function measuredVerdict(psnr) {
 
 /** A measured PSNR; null means that the frames are identical. */
 export const decibels = (psnr) => (psnr === null ? "∞ dB" : `${figure(psnr, 3)} dB`);
-
-/** The look of frames of a grade. */
-const LIKE = {
-  good: "Frames like these are close to the scene.",
-  usable: "Frames like these lack texture.",
-  bad: "Frames like these show only coarse shapes correctly.",
-};
 
 /** Number and highest severity of a job's findings; null if there are none. */
 export function doubts(job) {

@@ -1,7 +1,7 @@
 // One job: its quality, frames, files and method.
 
 import { actions, rename, saveMasks } from "./actions.js";
-import { announce, h, marked, put, trouble } from "./dom.js";
+import { about, announce, capital, h, marked, put, trouble } from "./dom.js";
 import { bytes, nameOf, stageOf, stateWord, timeOf } from "./format.js";
 import { isAborted, get, send } from "./api.js";
 import { Made } from "./provenance.js";
@@ -111,9 +111,10 @@ async function camera(found, viewer, signal) {
 
 /** The failure of a job: its reason, the remedy, and the page that explains it. */
 function failure({ error, problem }) {
-  return h("div", { class: "trouble", role: "alert" }, h("p", null, marked(error)),
+  const needsNew = error.includes("create a new calibration");
+  return h("div", { class: "trouble", role: "alert" }, h("p", null, marked(capital(error)), needsNew && [". ", h("a", { href: "#/new", class: "writes" }, "Upload the files for a new job")]),
     problem?.remedy && h("p", null, h("b", null, "What to do: "), marked(problem.remedy)),
-    problem && h("p", null, h("a", { href: `/problems/${problem.code}`, target: "_blank", rel: "noopener" }, "About this error (new tab)")));
+    problem && h("p", null, about(problem)));
 }
 
 /** Field that selects the snapshot of a job with several. */

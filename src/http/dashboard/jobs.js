@@ -40,6 +40,7 @@ export async function jobs(root, [query], signal) {
     const live = found.filter((job) => ["queued", "running"].includes(job.state));
     picked.hidden = found.length === 0;
     whole.checked = found.length > 0 && found.length === list.items.length;
+    whole.indeterminate = found.length > 0 && !whole.checked;
     const after = () => {
       none();
       look(null);

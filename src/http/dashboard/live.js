@@ -146,7 +146,7 @@ export function link(good) {
   if (good) answered = new Date();
   document.getElementById("offline").hidden = good;
   const since = answered ? `This page shows the state at ${moment(answered)}.` : "";
-  if (!good) say(document.getElementById("offline"), `The service does not answer. ${since} Retrying every few seconds; no data is lost.`);
+  if (!good) say(document.getElementById("offline"), `The service does not answer. ${since} Jobs are kept, and continue when it runs. Retrying every few seconds.`);
   const element = document.getElementById("link");
   say(element, good ? "live" : "offline");
   element.classList.toggle("lost", !good);

@@ -2,7 +2,7 @@
 // and a signal that is aborted when another view replaces it.
 
 import { forbidden, isAborted, isUnreachable } from "./api.js";
-import { h, put, trouble } from "./dom.js";
+import { capital, h, put, trouble } from "./dom.js";
 import { jobs } from "./jobs.js";
 import { link } from "./live.js";
 import { account, nameplate, signIn } from "./signin.js";
@@ -53,7 +53,7 @@ async function show() {
   } catch (error) {
     if (isAborted(error) || signal.aborted) return;
     if (isUnreachable(error)) silent(signal);
-    else if (error.status === 404) missing("Not found", `${error.message.replace(/^./, (letter) => letter.toUpperCase())}.`);
+    else if (error.status === 404) missing("Not found", `${capital(error.message)}.`);
     else if (!forbidden(error) && error.status !== 401) root.append(trouble(error));
   }
 }
@@ -79,7 +79,7 @@ function missing(title, reason) {
 /** Marks the menu entry of the current view. */
 function mark(path) {
   for (const entry of document.querySelectorAll("#nav a")) {
-    const here = path.startsWith(entry.getAttribute("href").slice(1));
+    const here = path.replace(/^\/compare\b/, "/jobs").startsWith(entry.getAttribute("href").slice(1));
     if (here) {
       entry.setAttribute("aria-current", "page");
       // On a phone, the menu may be wider than the screen.

@@ -1,6 +1,6 @@
 // A canvas that shows an image of any size, and loads only the visible tiles.
 
-import { h, say } from "./dom.js";
+import { capital, h, say } from "./dom.js";
 import { isAborted, picture } from "./api.js";
 import { figure } from "./format.js";
 import { pixel } from "./values.js";
@@ -113,17 +113,29 @@ export class Pane {
       say(this.readout, HINT);
       return;
     }
-    const { base, label } = this.source;
-    const key = `${base} ${row} ${column}`;
+    const { label } = this.source;
+    const bases = this.pictured(at).map(({ base }) => base);
+    const key = `${bases} ${row} ${column}`;
     if (this.pointed === key) return;
     this.pointed = key;
     const place = `Row ${row}, column ${column}`;
     try {
-      const value = await pixel({ base, height, width, version: this.generation }, row, column);
-      if (this.pointed === key) say(this.readout, `${place}: ${this.describe(value)}`);
+      const values = await Promise.all(bases.map((base) => pixel({ base, height, width, version: this.generation }, row, column)));
+      const words = values.map((value) => this.describe(value)).join(" and ");
+      const difference = values.length > 1 ? `, difference ${this.describe(values[0].map((one, index) => one - values[1][index]))}` : "";
+      if (this.pointed === key) say(this.readout, `${place}: ${words}${difference}`);
     } catch {
       if (this.pointed === key) say(this.readout, `${place} of ${label}`);
     }
+  }
+
+  /** The sources of the picture at a place: two of a difference, and one at each side of a wipe. */
+  pictured({ x }) {
+    if (!this.over) return [this.source];
+    const { source, at } = this.over;
+    if (at === undefined) return [this.source, source];
+    const { zoom, left } = this.place();
+    return [(x - left) * zoom < at * this.canvas.clientWidth ? this.source : source];
   }
 
   /** Overlays a second image as a wipe, right of a fraction of the width, or as a difference; null removes it. */
@@ -143,7 +155,7 @@ export class Pane {
   /** Shows a note in place of the image; an empty text hides it. */
   setNote(text) {
     this.note.hidden = !text;
-    say(this.note, text);
+    say(this.note, capital(text));
   }
 
   /** Discards the cached tiles, because the image has changed on the service. */

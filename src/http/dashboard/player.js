@@ -3,10 +3,14 @@
 import { figure } from "./format.js";
 import { h, put, say } from "./dom.js";
 
+/** The keys of a picture with a player, and further gestures. */
+export const keysHelp = (more) => h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
+  h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. ${more}`));
+
 /** Highest playback rate in frames per second, the refresh rate of fast screens. */
 const MAX_RATE = 240;
 
-/** Player of `count` frames; calls `show(frame)` with 1 to `count`. `nameOf` returns the name of a frame to display, if its number is not enough. */
+/** Player of `count` frames; calls `show(frame)` with 1 to `count`. `nameOf` returns the name of a band to display. */
 export class Player {
   constructor(count, signal, show, nameOf = null) {
     Object.assign(this, { count, show, nameOf, frame: 1, playing: false, ahead: () => true, onward: () => false });
@@ -21,7 +25,7 @@ export class Player {
     this.trueButton = h("button", { type: "button", class: "small", hidden: true, onclick: () => this.trueSpeed() }, "True speed");
     this.element = h("div", { class: "player" },
       h("div", { class: "row" }, this.button, this.step(-1, "Previous frame", "‹"), this.slider, this.step(1, "Next frame", "›"), this.text),
-      h("div", { class: "row" }, h("label", { for: "rate", class: "row muted" }, this.rate, "frames/s"), this.trueButton, this.slow,
+      h("div", { class: "row" }, h("label", { for: "rate", class: "row muted" }, this.rate, nameOf ? "bands/s" : "frames/s"), this.trueButton, this.slow,
         h("label", { for: "loop", class: "row muted" }, this.loop, "Loop")));
     signal.addEventListener("abort", () => this.stop(), { once: true });
     this.showPosition();

@@ -72,7 +72,7 @@ function times(job, { seconds_by_task: tasks, cpu_seconds: cpu, provider, gpu })
   const parts = long.map(([kind, seconds]) => `${TASKS[kind] ?? kind} ${duration(seconds)}`);
   return [
     ["Time", `${duration(since(job.created_at, job.started_at))} in the queue, then ${duration(took)} until the end`],
-    ["Time of the tasks", `${parts.join(", ") || "less than 1 s"}${long.reduce((sum, [, seconds]) => sum + seconds, 0) > took ? ", some at the same time" : ""}`],
+    ["Time of the tasks", `${parts.join(", ") || "< 1 s"}${long.reduce((sum, [, seconds]) => sum + seconds, 0) > took ? ", some at the same time" : ""}`],
     ["CPU time", `${duration(cpu)} for the tiles${[provider, gpu].filter(Boolean).map((device) => `, ${device}`).join("")}`],
   ];
 }

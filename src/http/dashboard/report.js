@@ -1,6 +1,6 @@
 // The report on a calibration: grade, findings with remedies, and correlation of the masks.
 
-import { facts, h, marked, put, s } from "./dom.js";
+import { capital, facts, h, marked, put, s } from "./dom.js";
 import { figure } from "./format.js";
 import { isAborted, get } from "./api.js";
 
@@ -42,7 +42,7 @@ const AGAIN_MS = 1000;
 
 /** Grade of a calibration, loaded when the element becomes visible and the grade exists. */
 export function grade(id, signal) {
-  const element = h("span", { class: "grade" }, " ");
+  const element = h("span", { class: "grade masks" }, " ");
   const ask = async () => {
     try {
       const { grade: found, findings: reasons } = await get(`/v1/calibrations/${id}/report`, signal);
@@ -88,10 +88,9 @@ async function load(item, body, signal) {
 function show(body, found) {
   const { masks, captures } = found;
   put(body,
-    h("p", { class: `judgement ${found.grade}` }, found.grade[0].toUpperCase() + found.grade.slice(1)),
+    h("p", { class: `judgement masks ${found.grade}` }, capital(found.grade)),
     findings(found.findings) ?? h("p", { class: "muted" }, "No fault found in the masks alone. Each measurement is checked for whether it belongs to them."),
-    h("div", { class: "figurepair" }, matrix(masks.correlation), bars(masks.frame_means)),
-    masks.correlation_mean !== null && h("p", { class: "muted" }, meaning(masks)),
+    h("div", { class: "figurepair" }, matrix(masks), bars(masks.frame_means)),
     h("details", null, h("summary", null, "All figures"), facts([
       ["Standard deviation over the frames", figure(masks.deviation)],
       ["1st to 99th percentile", `${figure(masks.percentile_1)} to ${figure(masks.percentile_99)}`],
@@ -107,12 +106,13 @@ function show(body, found) {
 }
 
 /** Explanation of the matrix for newcomers. */
-function meaning({ correlation_largest: largest }) {
-  return `Each cell shows the correlation of two masks, from 0 (empty) to 1 (full). The diagonal is each mask with itself; all other cells should be pale. The largest correlation is ${figure(largest)}.`;
+function meaning({ correlation_mean: mean, correlation_largest: largest }) {
+  return mean !== null && `Each cell shows the correlation of two masks, from 0 (empty) to 1 (full). The diagonal is each mask with itself; all other cells should be pale. The largest correlation is ${figure(largest)}.`;
 }
 
 /** Correlation matrix of the masks: blue above 0, orange below. */
-function matrix(values) {
+function matrix(masks) {
+  const { correlation: values } = masks;
   const count = values.length;
   const cell = (value, row, column) => s("rect", {
     x: column, y: row, width: 1.02, height: 1.02, class: value < 0 ? "less" : "more", "fill-opacity": Math.min(1, Math.abs(value)).toFixed(3),
@@ -122,7 +122,8 @@ function matrix(values) {
   const kept = values.filter((_, row) => row % step === 0).map((line) => line.filter((_, column) => column % step === 0));
   return h("figure", null, h("figcaption", { class: "muted" }, step > 1 ? `Correlation of every ${step}th mask` : "Correlation of the masks"),
     s("svg", { viewBox: `0 0 ${kept.length} ${kept.length}`, class: "matrix", role: "img", "aria-label": `Correlation matrix of ${count} masks` },
-      kept.map((line, row) => line.map((value, column) => cell(value, row, column)))));
+      kept.map((line, row) => line.map((value, column) => cell(value, row, column)))),
+    h("p", { class: "muted below" }, meaning(masks)));
 }
 
 /** Bar chart of the mean of each mask. */

@@ -1,6 +1,6 @@
 // Sign-in form, account view and sign-out.
 
-import { announce, facts, h, put, say } from "./dom.js";
+import { announce, facts, h, put } from "./dom.js";
 import { bytes } from "./format.js";
 import { selectLab, selectedLab } from "./storage.js";
 import { get, known, isUnreachable, signIn as beginSession, signOut as endSession } from "./api.js";
@@ -49,7 +49,7 @@ async function refusal(token) {
   }
 }
 
-/** Permissions of each role. */
+/** Permissions of each role in the lab of its token, or in all labs. */
 const ROLES = {
   read: "You may view everything in your lab, but change nothing.",
   submit: "You may upload, submit, cancel and delete in your lab.",
@@ -63,7 +63,7 @@ export async function account(root, _, signal) {
   const labs = me.all_labs ? await get("/v1/labs", signal) : null;
   const quota = limits.token_bytes === null ? null : h("meter", { min: 0, max: limits.token_bytes, value: use.token_bytes, high: 0.9 * limits.token_bytes, "aria-label": "Quota used" });
   put(root, h("div", { class: "row head" }, h("h1", null, `Lab ${me.lab}`), h("span", { class: "badge" }, me.role), h("span", { class: "grow" }), me.token && signOut()),
-    h("p", null, me.token ? ROLES[me.role] : "Sign-in is off, because this service has no tokens."),
+    h("p", null, me.token ? ROLES[me.role].replace("your lab", me.all_labs ? "every lab" : "your lab") : "Sign-in is off, because this service has no tokens."),
     h("div", { class: "cards" },
       h("section", { class: "card", "aria-label": "Quota" }, h("h2", null, "Quota"), quota, facts([
         ["Uploads of this token", use.token_bytes === null ? null : `${bytes(use.token_bytes)}${limits.token_bytes === null ? ", no limit" : ` of ${bytes(limits.token_bytes)}`}`],
@@ -71,7 +71,7 @@ export async function account(root, _, signal) {
         ["Memory of a job", `at most ${bytes(limits.worker_memory_bytes)}`],
       ])),
       h("section", { class: "card", "aria-label": "Lab" }, h("h2", null, "Lab"), facts([
-        ["Files", `${use.uploads}, ${bytes(use.upload_bytes)}`],
+        ["Files", use.uploads === 0 ? "no files" : `${use.uploads}, ${bytes(use.upload_bytes)}`],
         ["Results", bytes(use.result_bytes)],
         ["Queued and running jobs", h("a", { href: "#/jobs?state=queued,running" }, String(use.jobs))],
         me.token && ["Token", h("code", null, me.token)],
@@ -85,7 +85,7 @@ function allLabs(labs, here) {
   const row = ({ lab, share, use }) => h("tr", null, h("th", { scope: "row" }, lab), h("td", null, share), h("td", null, use.jobs), h("td", null, bytes(use.bytes)),
     h("td", null, lab === here ? "shown" : look(lab)));
   return h("section", { class: "card", "aria-label": "All labs" }, h("h2", null, "All labs"),
-    h("p", { class: "muted" }, "You may view and manage every lab. This tab shows the jobs, files and calibrations of the lab that you select."),
+    h("p", { class: "muted" }, "This tab shows the jobs, files and calibrations of the lab that you select."),
     selectedLab() && h("div", { class: "row" }, h("button", { type: "button", onclick: () => change(null) }, "Back to your own lab")),
     h("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Labs" }, h("table", null, h("thead", null, h("tr", null, ["Lab", "Share", "Queued and running jobs", "Stored", "In this tab"].map((text) => h("th", { scope: "col" }, text)))), h("tbody", null, labs.map(row)))));
 }
@@ -115,7 +115,7 @@ function signOut() {
 export async function nameplate(element) {
   try {
     const me = await get("/v1/me");
-    say(element, me.token ? `${selectedLab() ? "viewing " : ""}${me.lab} · ${me.role}` : me.lab);
+    put(element, me.token ? [`${selectedLab() ? "viewing " : ""}${me.lab}`, h("span", null, ` · ${me.role}`)] : me.lab);
     document.body.dataset.role = me.role;
     element.hidden = false;
     return true;

@@ -146,20 +146,25 @@ function stored(known, wanted, use, signal) {
 }
 
 function masks(settings, use, verdict, signal) {
-  // The file that was dropped last, with the full scale, array and axes stated for it.
-  let last = null;
+  // The file that was dropped last, with the full scale, array and axes stated for it, and the number of the latest attempt.
+  let [last, attempt] = [null, 0];
   const repeat = () => last && make(...last).catch((error) => put(verdict, problem(error)));
   const part = partFields("masks-part", true, repeat);
   const make = async (sha256, stated) => {
+    attempt += 1;
+    const mine = attempt;
     last = [sha256, stated];
     use(null);
     put(verdict);
     try {
       const item = await create("/v1/calibrations", { masks: sha256, ...settings(), ...part.value(), ...stated }, signal);
+      // A later attempt has replaced this one.
+      if (mine !== attempt) return;
       const again = (full_scale) => make(sha256, { ...stated, full_scale }).catch((later) => put(verdict, problem(later)));
       put(verdict, accepted(item, signal), h("details", null, h("summary", null, `Full scale of the masks: ${exact(item.full_scale)}`), askScale(again, "Which stored number means 1, an open mask?")));
       use(item);
     } catch (error) {
+      if (mine !== attempt) return;
       if (isAborted(error)) throw error;
       const again = (next) => make(sha256, next).catch((later) => put(verdict, problem(later)));
       put(verdict, problem(error), askAbout(error, sha256, stated, again, { frames: () => askFrames(error, part, repeat) }));
@@ -209,7 +214,7 @@ function accepted(item, signal) {
       [item.dispersion ? "Masks of bands" : "Masks", `${item.frames} of ${item.height} × ${item.width}${item.sample ? `, ${item.sample} in ${item.format}` : ""}`],
       item.mosaic && ["Sensor", `in colour, ${item.mosaic.toUpperCase()}`],
       ["Mean transmission", figure(item.mask_mean)],
-      ["Dead pixels", dead > 0 ? h("span", { class: "warn" }, `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them`) : "none"],
+      ["Dead pixels", dead > 0 ? `${item.dead_pixels} (${figure(100 * dead, 2)} %): no light reaches them` : "none"],
       item.clipped_negatives > 0 && ["Values below 0", h("span", { class: "warn" }, `${item.clipped_negatives}, set to 0`)],
       ["Grade", [grade(item.id, signal), " ", h("a", { href: `#/calibrations/${item.id}`, target: "_blank" }, "Report (new tab)")]],
     ]),
@@ -223,7 +228,7 @@ function measurementStep(form, changed, signal) {
   const wait = h("p", { class: "muted" }, "Select or create the calibration first.");
   const name = textField("measurement-name", "Name of the measurement", "shot 12");
   const [fps, exposure] = [numberField("fps", "Snapshots per second"), numberField("exposure", "Exposure in s")];
-  const saturation = numberField("saturation", "Saturated from (stored number)", 1);
+  const saturation = numberField("saturation", "Saturated from", 1);
   const sequence = h("select", { id: "sequence" }, SEQUENCES.map(([value, text]) => h("option", { value }, text)));
   const darks = [];
   const darkList = h("p", { class: "muted" });

@@ -1,7 +1,7 @@
 // State of the service: what an administrator looks for first, in words.
 
-import { facts, h, put } from "./dom.js";
-import { bytes, duration, moment, momentInFull, nameOf, short } from "./format.js";
+import { capital, facts, h, marked, put } from "./dom.js";
+import { bytes, duration, moment, momentInFull, nameOf, short, stateWord } from "./format.js";
 import { every } from "./live.js";
 import { get } from "./api.js";
 
@@ -27,8 +27,8 @@ const count = (number, one, many = `${one}s`) => `${number === 0 ? "no" : number
 /** The state in one sentence. */
 function summary({ jobs, workers: { length: alive }, disk: { free_bytes: free } }) {
   const [running, queued] = [jobs.running + jobs.cancelling, jobs.queued];
-  const work = running + queued === 0 ? "No job runs or waits" : `${count(running, "job")} running, ${queued || "none"} waiting`;
-  return `${work[0].toUpperCase()}${work.slice(1)}; ${count(alive, "worker")} ready; ${bytes(free)} free.`;
+  const work = running + queued === 0 ? "No job is running or queued" : `${count(running, "job")} running, ${queued || "none"} queued`;
+  return `${capital(work)}; ${count(alive, "worker")} ready; ${bytes(free)} free.`;
 }
 
 function card(title, ...content) {
@@ -47,13 +47,13 @@ function service(found) {
   ]));
 }
 
-const STATES = [["running", "Running"], ["queued", "Waiting"], ["cancelling", "Stopping"], ["succeeded", "Finished"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
+const STATES = ["running", "queued", "cancelling", "succeeded", "failed", "cancelled"];
 
 function queue(found) {
-  const jobs = ([state, word]) => [word, found.jobs[state] === 0 ? "none" : h("a", { href: `#/jobs?state=${state}` }, count(found.jobs[state], "job"))];
+  const jobs = (state) => [capital(stateWord(state)), found.jobs[state] === 0 ? "none" : h("a", { href: `#/jobs?state=${state}` }, count(found.jobs[state], "job"))];
   const { running, ready, blocked } = found.queue;
   const open = ["running", "queued", "cancelling"];
-  return card("Queue", facts(STATES.filter(([state]) => state !== "cancelling" || found.jobs[state] > 0).map(jobs)),
+  return card("Queue", facts(STATES.filter((state) => state !== "cancelling" || found.jobs[state] > 0).map(jobs)),
     h("p", { class: "muted" }, open.some((state) => found.jobs[state] > 0) || running + ready + blocked > 0
       ? `Tasks: ${running} running, ${ready} ready for a worker, ${blocked} waiting for others.` : "No tasks are open."));
 }
@@ -75,7 +75,7 @@ function errors({ items }) {
   if (items.length === 0) return card("Last errors", h("p", { class: "muted" }, "No job of this lab has failed."));
   return card("Last errors", h("ul", { class: "findings" }, items.map((job) => h("li", { class: "error" },
     h("p", null, h("a", { href: `#/jobs/${job.id}` }, nameOf(job)), " ", h("span", { class: "muted" }, moment(job.finished_at))),
-    h("p", null, job.error)))));
+    h("p", null, marked(capital(job.error)))))));
 }
 
 function workers(found) {

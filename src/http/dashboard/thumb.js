@@ -5,51 +5,66 @@ const SIDE = 72;
 /** Largest file in bytes that is read for a thumbnail. */
 const MAX_BYTES = 64 * 2 ** 20;
 
-/** A canvas with the first image of a file, or null. */
+/** The first image of a file as a `Thumbnail`, or null. */
 export async function thumb(file) {
   try {
     if (file.size > MAX_BYTES) return null;
     const bytes = await file.arrayBuffer();
     const first = new Uint8Array(bytes, 0, Math.min(8, bytes.byteLength));
-    if (first[0] === 0x89 && first[1] === 0x50) return drawn(await createImageBitmap(file));
-    if (first[0] === 0x93 && first[1] === 0x4e) return grey(npy(bytes));
-    if ((first[0] === 0x49 && first[1] === 0x49) || (first[0] === 0x4d && first[1] === 0x4d)) return grey(tiff(bytes));
+    const image = first[0] === 0x89 && first[1] === 0x50 ? decoded(await createImageBitmap(file))
+      : first[0] === 0x93 && first[1] === 0x4e ? npy(bytes)
+        : (first[0] === 0x49 && first[1] === 0x49) || (first[0] === 0x4d && first[1] === 0x4d) ? tiff(bytes) : null;
+    return image && new Thumbnail(image);
   } catch {
     // The service reports what is wrong with the file.
   }
   return null;
 }
 
-function canvasOf(width, height) {
+/** Width and height of a thumbnail of an image. */
+function sizeOf({ width, height }) {
   const scale = SIDE / Math.max(width, height);
-  return Object.assign(document.createElement("canvas"), { width: Math.max(1, Math.round(width * scale)), height: Math.max(1, Math.round(height * scale)), className: "thumbnail" });
+  return { width: Math.max(1, Math.round(width * scale)), height: Math.max(1, Math.round(height * scale)) };
 }
 
-function drawn(bitmap) {
-  const canvas = canvasOf(bitmap.width, bitmap.height);
-  canvas.getContext("2d").drawImage(bitmap, 0, 0, canvas.width, canvas.height);
+/** An image that the browser has decoded, in the size of its thumbnail. */
+function decoded(bitmap) {
+  const { width, height } = sizeOf(bitmap);
+  const context = new OffscreenCanvas(width, height).getContext("2d");
+  context.drawImage(bitmap, 0, 0, width, height);
   bitmap.close();
-  return canvas;
+  const { data } = context.getImageData(0, 0, width, height);
+  return { width, height, at: (index) => data[4 * index + 1] };
 }
 
-/** Draws `{width, height, at(index)}` between its smallest and largest value; grey if they are equal. */
-function grey(picture) {
-  if (!picture) return null;
-  const canvas = canvasOf(picture.width, picture.height);
-  const { width, height } = canvas;
-  const values = new Float32Array(width * height);
-  for (let y = 0; y < height; y += 1) {
-    for (let x = 0; x < width; x += 1) {
-      const [row, column] = [Math.floor((y * picture.height) / height), Math.floor((x * picture.width) / width)];
-      values[y * width + x] = picture.at(row * picture.width + column);
-    }
+/** A small canvas, and the smallest and largest value that it shows. */
+class Thumbnail {
+  /** `at(index)` is a value of the image. */
+  constructor(image) {
+    this.canvas = Object.assign(document.createElement("canvas"), sizeOf(image));
+    const { width, height } = this.canvas;
+    this.values = Float32Array.from({ length: width * height }, (_, index) => {
+      const [y, x] = [Math.floor(index / width), index % width];
+      return image.at(Math.floor((y * image.height) / height) * image.width + Math.floor((x * image.width) / width));
+    });
+    const finite = this.values.filter(Number.isFinite);
+    [this.low, this.high] = [Math.min(...finite), Math.max(...finite)];
   }
-  const low = values.reduce((one, other) => Math.min(one, other), Infinity);
-  const span = values.reduce((one, other) => Math.max(one, other), -Infinity) - low;
-  const image = new ImageData(width, height);
-  values.forEach((value, index) => image.data.set([0, 0, 0].map(() => (span > 0 ? (255 * (value - low)) / span : 128)).concat(255), 4 * index));
-  canvas.getContext("2d").putImageData(image, 0, 0);
-  return canvas;
+
+  /** Draws the values between black at `low` and white at `high`; grey if these are equal. */
+  draw(low, high) {
+    const { width, height } = this.canvas;
+    const image = new ImageData(width, height);
+    this.values.forEach((value, index) => image.data.set([0, 0, 0].map(() => (high > low ? (255 * (value - low)) / (high - low) : 128)).concat(255), 4 * index));
+    this.canvas.getContext("2d").putImageData(image, 0, 0);
+  }
+}
+
+/** Draws thumbnails with one range of values, so that a dark capture is darker than a bright one. */
+export function shade(thumbnails) {
+  const low = Math.min(...thumbnails.map((one) => one.low));
+  const high = Math.max(...thumbnails.map((one) => one.high));
+  thumbnails.forEach((one) => one.draw(low, high));
 }
 
 function reader(bytes, offset, kind, little) {

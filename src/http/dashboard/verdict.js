@@ -47,12 +47,16 @@ export class Verdict {
     if (!written) {
       const words = { failed: ["Failed", "bad"], cancelled: ["Cancelled", ""], cancelling: ["Being cancelled", ""] }[job.state] ?? ["Not known yet", ""];
       const { previews_done: previews, tiles_done: tiles } = job.progress;
-      const ended = previews + tiles > 0 ? "The frames are incomplete: don’t rely on them." : "There are no frames.";
+      const isEmpty = previews + tiles === 0;
+      // Findings on the inputs do not explain why a job has no frames.
+      this.found.hidden = this.calibration.hidden = job.state === "failed" && isEmpty;
+      const ended = !isEmpty ? "The frames are incomplete: don’t rely on them." : "There are no frames.";
       this.judge(...words, job.state in { failed: 1, cancelled: 1, cancelling: 1 } ? ended : "The frames are judged when they are written.");
       put(this.measured);
       put(this.expected);
       return;
     }
+    this.found.hidden = this.calibration.hidden = false;
     const { content } = manifest;
     this.assessment = content?.assessment ?? null;
     put(this.found, findings(findingsOf(job, this.assessment)));
@@ -137,7 +141,7 @@ export class Verdict {
     const rows = found.frames.map((frame) => [frame.frame, frame.psnr ?? "inf", frame.ssim ?? ""]);
     put(this.measured, h("p", { class: "quality" }, h("b", null, decibels(found.psnr)), " PSNR measured", found.ssim !== null && [", ", h("span", { class: "together" }, h("b", null, figure(found.ssim, 3)), " SSIM")]),
       h("p", { class: "muted" }, `Against the true frames of this job; mean of ${found.frames.length} ${spectral ? "bands" : "frames"}, relative to the white level, ${inUnits(found.peak, this.fullScale)}.`),
-      h("details", { open: true }, h("summary", null, spectral ? "PSNR band by band" : "PSNR frame by frame"),
+      h("details", { open: true }, h("summary", null, `PSNR in dB, ${spectral ? "band by band" : "frame by frame"}`),
         curve.length > 1 && curve.every(Number.isFinite) && plot(curve, { xName, xs, yName: "PSNR in dB", width: 270 }),
         h("div", { class: "row" }, csvLink(`${this.job.id.slice(-8)}_${this.snapshot}_quality.csv`, [spectral ? "band" : "frame", "psnr_db", "ssim"], rows))));
     return true;

@@ -1,12 +1,12 @@
 // The frames in a large player, synchronised with the measurement.
 
-import { h, say } from "./dom.js";
+import { capital, h, say } from "./dom.js";
 import { Contrast } from "./contrast.js";
 import { Pane } from "./pane.js";
-import { Player } from "./player.js";
+import { Player, keysHelp } from "./player.js";
 import { Slice } from "./slice.js";
 import { View } from "./view.js";
-import { axisOf, frameName, inUnit, unitOf } from "./format.js";
+import { axisOf, frameName, unitOf, valueIn } from "./format.js";
 import { get, isUnreachable } from "./api.js";
 import { Probe } from "./probe.js";
 import { sampled } from "./values.js";
@@ -24,8 +24,6 @@ const MODES = [
 const SIGNED = ["difference", "deviation"];
 /** Pictures that are the same for all frames. */
 const STILL = ["colours", "residual"];
-
-const capital = (text) => text.replace(/^./, (letter) => letter.toUpperCase());
 
 export class Viewer {
   constructor(job, signal) {
@@ -64,10 +62,10 @@ export class Viewer {
     const stack = () => ({ base: this.base(), height, width, version: this.right.generation });
     const picture = () => this.ready && { ...stack(), height: this.view.height, width: this.view.width, base: this.source(this.player.frame).base };
     this.probe = new Probe(this.right, axisOf(job), { picture, stack, called: () => capital(frameName(job, this.player.frame)), unit: () => this.unit() }, () => `${job.id.slice(-8)}_${this.snapshot}`, signal);
-    for (const pane of [this.left, this.right]) pane.describe = (value) => this.words(value);
-    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.meaning, this.probe.element, this.slicing,
-      h("details", { class: "keys" }, h("summary", null, "Keys and gestures"),
-        h("p", { class: "muted" }, `Keys on a picture: space plays, ← → step, + − 0 1 zoom, shift and arrows move. The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`)));
+    for (const pane of [this.left, this.right]) pane.describe = (value) => valueIn(value, this.unit());
+    const keys = keysHelp(`The wheel zooms; dragging moves. A click shows ${spectral ? "the spectrum of a pixel" : "a pixel through time"}. On a touch screen, two fingers zoom and move; in full screen, one finger also moves.`);
+    this.controls = [this.player.element, this.rightContrast.element, this.right.tools, this.probe.element, this.slicing, keys];
+    this.element = h("section", { class: "card viewer", "aria-label": "Frames" }, this.right.element, this.player.element, this.rightContrast.element, this.meaning, this.probe.element, this.slicing, keys);
     this.measured = null;
     this.beside = h("section", { class: "card viewer beside", "aria-label": "Measurement" }, this.left.element);
     this.player.keys(this.element);
@@ -91,12 +89,6 @@ export class Viewer {
   /** Factor and words of the unit of values. */
   unit() {
     return unitOf(this.fullScale);
-  }
-
-  /** A value in the user's units. */
-  words(value) {
-    const unit = this.unit();
-    return `${value.map((one) => inUnit(one, unit, 4)).join(", ")} ${unit.words}`;
   }
 
   /** Sets the stored number that means 1. */
@@ -238,12 +230,14 @@ export class Viewer {
       this.ready = false;
       this.right.show(null);
       this.right.setNote(error.code !== "not_ready" ? error.message : ["failed", "cancelled"].includes(this.state) ? "The job ended before any frame was computed." : "No frames yet. A coarse preview comes first, then the frames tile by tile.");
-      this.rightContrast.element.hidden = this.player.element.hidden = true;
+      // Other pictures of a job may be missing, but without frames there are none.
+      const unusable = this.mode() === "frame" ? this.controls : this.controls.slice(0, 2);
+      unusable.forEach((element) => (element.hidden = true));
       return;
     }
     this.ready = true;
+    this.controls.forEach((element) => (element.hidden = false));
     this.player.element.hidden = STILL.includes(this.mode());
-    this.rightContrast.element.hidden = false;
     this.right.setNote("");
     this.showRight();
   }
