@@ -566,7 +566,7 @@ mod tests {
     #[test]
     fn edges_of_a_scene_are_no_dead_lines() {
         let bars = |period: usize| {
-            move |_: usize, i: usize, _: usize| f32::from(u8::from(i / period % 2 == 0))
+            move |_: usize, i: usize, _: usize| f32::from(u8::from((i / period).is_multiple_of(2)))
         };
         let boxed = |k: usize, i: usize, j: usize| {
             let at = 20 + 2 * k;

@@ -302,7 +302,7 @@ impl MeasurementStudy {
         let limit = -NEGATIVE_SHARE * mean.abs();
         let negative = blocks().filter(|(mean, _)| **mean < limit).map(|(_, measured)| measured);
         let negative_area = negative.sum::<f64>() / measured;
-        // Masks with a constant sum leave no structure of a still scene, so noise is all that there is.
+        // Masks with a constant sum leave no structure of a still scene, only noise.
         let balanced = fit.as_ref().is_some_and(|fit| fit.balance < MIN_BALANCE);
         let flat = if balanced { FLAT_BEHIND_BALANCED } else { FLAT };
         if self.energy <= self.pixels * (flat * mean).powi(2) {
@@ -948,10 +948,10 @@ mod tests {
     /// Discs on black that cover little of the picture.
     fn cells(frames: usize, side: usize) -> Array3<f32> {
         Array3::from_shape_fn((frames, side, side), |(k, i, j)| {
-            let near = |row: f32, column: f32, radius: f32| {
+            let is_within = |row: f32, column: f32, radius: f32| {
                 (i as f32 - row - k as f32).hypot(j as f32 - column) < radius
             };
-            let is_cell = near(30.0, 40.0, 8.0) || near(90.0, 70.0, 10.0) || near(60.0, 100.0, 9.0);
+            let is_cell = is_within(30.0, 40.0, 8.0) || is_within(90.0, 70.0, 10.0);
             if is_cell { 0.8 } else { 0.0 }
         })
     }
