@@ -405,8 +405,8 @@ impl Defects {
 /// Share of saturated pixels, and of outliers, from which there is a finding, and from which frames are wrong.
 const REPORTED_SHARE: f64 = 0.001;
 const GRAVE_SHARE: f64 = 0.2;
-/// Share of pixels marked as not measured above which frames are wrong. The expected PSNR was compared with the true one up
-/// to this share.
+/// Share of pixels marked as not measured, outside of areas without a measured pixel, above which frames are wrong. The
+/// expected PSNR was compared with the true one up to this share.
 const MAX_MISSING: f64 = 0.5;
 /// Side of the areas that are searched for measured pixels.
 const AREA: usize = 16;
@@ -474,7 +474,9 @@ pub fn judge_defects(defects: &Defects, pixels: usize) -> Vec<Finding> {
             );
         }
         // The user knows of the pixels that are marked. Frames follow the measurement where it is measured.
-        let grave = share(outliers + frozen) > GRAVE_SHARE || share(missing) > MAX_MISSING;
+        let rest = pixels.saturating_sub(unmeasured).max(1) as f64;
+        let scattered = missing.saturating_sub(unmeasured) as f64 / rest;
+        let grave = share(outliers + frozen) > GRAVE_SHARE || scattered > MAX_MISSING;
         findings.push(Finding::new(FindingCode::BadPixels, detail).escalate_if(grave));
     }
     findings
