@@ -156,6 +156,15 @@ fn the_expected_psnr_counts_parts_that_were_not_measured() {
         assert!(low < found && found < high, "{low} to {high} dB, {found} dB found");
         assert!(report["verdict"] != "good", "{report:#}");
     }
+    // Masks that are not known there leave the same gap.
+    let mut unknown = masks.clone();
+    let is_lost = |at: &usize| at % PIXELS / 96 < 32 && at % 96 < 64;
+    (0..unknown.len()).filter(is_lost).for_each(|at| unknown[at] = f32::NAN);
+    let (of_masks, _) = reconstruct(&unknown, float(y.iter().copied()), &TV);
+    let (of_pixels, _) = reconstruct(&masks, lost(32, f32::NAN), &TV);
+    let [_, of_masks, _] = expected(&of_masks);
+    let [_, of_pixels, _] = expected(&of_pixels);
+    assert!((of_masks - of_pixels).abs() < 1.0, "{of_masks} dB, {of_pixels} dB");
 }
 
 #[tokio::test]

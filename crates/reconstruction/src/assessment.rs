@@ -184,7 +184,7 @@ pub enum Coverage {
 const MIN_MEASURED: f32 = 1.0 / 16.0;
 
 /// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\] behind masks with the sum `light` \[H,W\]. NaN
-/// were not measured.
+/// of `y` were not measured, also where the light is 0: the masks there may be unknown.
 pub fn coverage(y: ArrayView3<'_, f32>, light: ArrayView2<'_, f32>) -> Array3<Coverage> {
     let (snapshots, height, width) = y.dim();
     let (rows, columns) = blocks(height, width);
@@ -192,10 +192,10 @@ pub fn coverage(y: ArrayView3<'_, f32>, light: ArrayView2<'_, f32>) -> Array3<Co
     let share = |is: &dyn Fn(usize, usize) -> bool| {
         over_blocks((height, width), |i, j| f32::from(u8::from(is(i, j))))
     };
-    let closed = share(&|i, j| light[[i, j]] == 0.0);
     for (y, mut all) in y.outer_iter().zip(all.outer_iter_mut()) {
         let is_dark = y.iter().all(|value| value.is_nan() || *value == 0.0);
         let measured = share(&|i, j| light[[i, j]] > 0.0 && !y[[i, j]].is_nan());
+        let closed = share(&|i, j| light[[i, j]] == 0.0 && !y[[i, j]].is_nan());
         Zip::from(&mut all).and(&measured).and(&closed).for_each(|block, measured, closed| {
             *block = match () {
                 () if *measured < MIN_MEASURED && *closed > 0.5 => Coverage::Closed,

@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use ndarray::{Array3, ArrayView3};
 use strum::Display;
 
-use super::assessment::{Coverage, Evidence, Features, coverage};
+use super::assessment::{Coverage, Evidence, Features};
 use super::error::{Result, check_shape, shape_text};
 use super::gap::{Solver, run_stage};
 use super::operator::SensingOperator;
@@ -47,8 +47,8 @@ pub struct Outcome {
     pub features: Vec<Features>,
     /// Hold-out evidence of the frames' error, if requested.
     pub evidence: Option<Evidence>,
-    /// The coverage of each block by the measurement \[S, rows, columns\].
-    pub coverage: Array3<Coverage>,
+    /// The coverage of each block by the measurement \[S, rows, columns\], if requested.
+    pub coverage: Option<Array3<Coverage>>,
 }
 
 /// Reconstructs the `S B` frames of a run of snapshots `y` \[S,H,W\], both on the scale on which the scene is on \[0,1\].
@@ -145,7 +145,7 @@ pub(crate) fn run_stages(
         stop_reason: if converged { StopReason::Converged } else { StopReason::MaxIterations },
         features: Vec::new(),
         evidence: None,
-        coverage: coverage(y, op.masks().sum_axis(ndarray::Axis(0)).view()),
+        coverage: None,
     })
 }
 

@@ -73,8 +73,9 @@ impl TileAssessment {
             let levels = levels.iter_mut().skip(piece.first_frame * rows * columns);
             levels.zip(&errors).for_each(|(place, error)| *place = level(error));
         }
-        let ratio = frames / outcome.coverage.dim().0.max(1);
-        for ((snapshot, row, column), coverage) in outcome.coverage.indexed_iter() {
+        let coverage = outcome.coverage.iter().flat_map(|all| all.indexed_iter());
+        let ratio = frames / outcome.coverage.as_ref().map_or(1, |all| all.dim().0.max(1));
+        for ((snapshot, row, column), coverage) in coverage {
             let level = match coverage {
                 Coverage::Measured => continue,
                 Coverage::Dark => DARK,
@@ -382,7 +383,8 @@ fn fast_motion(motion: f32) -> Option<Finding> {
 
 fn unfamiliar_masks_finding() -> Finding {
     let detail = "the masks have a nearly constant sum, or they are highly correlated and not sharp: they are blurred, or \
-                  closed pixels let light through. The expected PSNR is often far from the true one behind such masks, so its interval is wider";
+                  closed pixels let light through. The expected PSNR is often far from the true one behind such masks, so its \
+                  interval is wider";
     Finding::new(FindingCode::UnfamiliarMasks, detail)
 }
 

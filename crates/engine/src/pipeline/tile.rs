@@ -78,7 +78,7 @@ impl TileInput {
             stop_reason: StopReason::Converged,
             features: Vec::new(),
             evidence: None,
-            coverage: coverage(measured.view(), self.masks.sum_axis(Axis(0)).view()),
+            coverage: None,
         };
         let Some((mut op, y)) = self.on_unit_scale()? else { return Ok(combined) };
         let total: usize = pieces.iter().map(Range::len).sum();
@@ -126,6 +126,8 @@ pub fn reconstruct_tile(
     observer: &mut dyn Observer,
 ) -> Result<Outcome, ReconError> {
     let assessed = Model::of(schedule).is_some();
+    let light = input.masks.sum_axis(Axis(0));
+    let coverage = assessed.then(|| coverage(input.y.view(), light.view()));
     // For longer schedules the pilot provides the evidence.
     let is_tv_only = schedule.stages.len() == 1;
     let mut evidence = None;
@@ -144,6 +146,7 @@ pub fn reconstruct_tile(
         solver::reconstruct_assessed(op, y, schedule, networks, observer)
     })?;
     outcome.evidence = evidence;
+    outcome.coverage = coverage;
     Ok(outcome)
 }
 
@@ -158,7 +161,7 @@ pub fn run_network(
         Ok(Outcome {
             features: Vec::new(),
             evidence: None,
-            coverage: coverage(y, op.masks().sum_axis(Axis(0)).view()),
+            coverage: None,
             // Networks know no missing pixels.
             frames: network.frames(filled(y.index_axis(Axis(0), 0)).view(), op.masks())?,
             iterations: 0,
@@ -192,6 +195,27 @@ mod tests {
             0.5 + 0.3 * ((i + k) as f32 * 0.2).sin() * (j as f32 * 0.1).cos()
         });
         (masks, frames)
+    }
+
+    /// Areas of unknown masks were not measured, those of closed masks have no light, however the snapshots are divided.
+    #[test]
+    fn blocks_have_the_coverage_of_their_masks_and_pixels() {
+        use reconstruction::assessment::Coverage::{Closed, Measured, Unmeasured};
+        let mut masks = iid_masks(4, 32, 48, 3).unwrap();
+        let y = measure(masks.view(), Array3::from_elem((4, 32, 48), 0.5).view()).unwrap();
+        masks.slice_mut(s![.., ..16, ..16]).fill(f32::NAN);
+        masks.slice_mut(s![.., ..16, 16..32]).fill(0.0);
+        let mut y = ndarray::stack![Axis(0), y, y];
+        y.slice_mut(s![.., ..16, ..16]).fill(f32::NAN);
+        y.slice_mut(s![.., ..16, 16..32]).fill(0.0);
+        y.slice_mut(s![.., 16.., 32..]).fill(f32::NAN);
+        for pieces in [vec![0..2], vec![0..1, 1..2]] {
+            let input = TileInput { masks: masks.clone(), y: y.clone(), white: 1.0, pieces };
+            let schedule = Schedule::gap_tv().with_iterations(3);
+            let outcome = reconstruct_tile(input, &schedule, &mut (), &mut ()).unwrap();
+            let expected = [Unmeasured, Closed, Measured, Measured, Measured, Unmeasured].repeat(2);
+            assert_eq!(outcome.coverage.unwrap().into_iter().collect::<Vec<_>>(), expected);
+        }
     }
 
     #[test]
