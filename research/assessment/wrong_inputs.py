@@ -181,6 +181,26 @@ def cluster(value):
     return change
 
 
+def area(change):
+    """Changes the light of 40 rows and columns: `change(y, light, rng)`, where light is that of the scene without masks."""
+    def make(scene):
+        given, rng = taken(scene), np.random.default_rng([8, scene.index])
+        row, column = rng.integers(8, scene.clean.shape[0] - 48, 2)
+        place = np.s_[row:row + 40, column:column + 40]
+        y = given.y.copy()
+        y[place] = change(y[place], scene.truth.sum(0)[place] / 2, rng)
+        return dataclasses.replace(given, y=y, scale=given.counts())
+    return make
+
+
+def frozen(y, light, rng):
+    return y.mean() * (1 + .01 * rng.standard_normal(y.shape))
+
+
+def unmasked(y, light, rng):
+    return light * (1 + .01 * rng.standard_normal(y.shape))
+
+
 def moved(masks, rows, columns):
     """Masks that are displaced by a fraction of a pixel."""
     matrix = np.float32([[1, 0, columns], [0, 1, rows]])
@@ -319,6 +339,8 @@ KINDS = [
     Kind('a hot column', ('bad_pixels', 'saturated'), with_pixels(lines(1))),
     Kind('a dead column', ('bad_pixels',), with_pixels(lines(0))),
     Kind('clusters of 3x3 hot pixels', ('bad_pixels', 'saturated'), with_pixels(cluster(1))),
+    Kind('a part of the sensor with noise alone', ('unmodulated_area',), area(frozen)),
+    Kind('a part of the picture without masks', ('unmodulated_area',), area(unmasked)),
     Kind('a snapshot of 0', ('refused: 0',), lambda s: taken(s, y=s.dark)),
     Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
 

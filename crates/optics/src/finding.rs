@@ -213,6 +213,10 @@ findings! {
         "a mask is missing",
         "send one mask for each frame of the exposure, in the order in which the patterns are shown; if none is missing, \
          record the dark frames again";
+    UnmodulatedArea: [Measurement], [Warning],
+        "the masks do not modulate the light of a part of the picture",
+        "look there for glare, a reflection, or a part of the sensor that repeats old values; if it can't be removed, \
+         mark the part in the map of `bad_pixels` of the calibration";
     ForeignMasks: [Measurement], [Error],
         "the masks do not explain the measurement",
         "name the calibration that belongs to this measurement, or calibrate again";
@@ -278,6 +282,7 @@ impl FindingCode {
             | Self::ShiftedMasks
             | Self::TurnedMasks
             | Self::UnexplainedPixels
+            | Self::UnmodulatedArea
             | Self::WrongDark => Some(Doubt::Inputs),
             Self::LeftAligned | Self::Level | Self::RightAligned => Some(Doubt::Scale),
             _ => None,

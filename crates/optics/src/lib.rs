@@ -22,6 +22,7 @@ mod mask_values;
 mod masks;
 mod measurement_check;
 mod measurement_fit;
+mod modulation;
 mod mosaic;
 mod multiplex;
 mod order;

@@ -18,6 +18,7 @@ use super::mask_values::{Alteration, Observed, alteration};
 use super::measurement_fit::{
     BLOCK, Fit, LocalFit, Strip, brightness_errors, equal_weights, reweighted,
 };
+use super::modulation::{Run, Unmodulated, unmodulated};
 use super::{Finding, FindingCode};
 
 /// Largest shift between masks and measurement that is searched, in pixels along each axis.
@@ -95,6 +96,7 @@ pub struct MeasurementStudy {
     /// True if all mask values are 0 or 1.
     is_binary: bool,
     strips: Vec<Strip>,
+    runs: Vec<Run>,
 }
 
 /// A part of a window.
@@ -145,6 +147,8 @@ pub struct MeasurementFigures {
     pub alteration: Option<Alteration>,
     /// Signs of a displacement of the masks by less than a pixel along the rows and the columns.
     pub drift: [Drift; 2],
+    /// Parts whose light the masks do not modulate.
+    pub unmodulated: Option<Unmodulated>,
     /// Brightness of the brightest parts of the scene.
     pub brightest: f64,
     /// Brightness of the brightest block, which may be a small object.
@@ -212,6 +216,7 @@ impl MeasurementStudy {
             largest_mask: 0.0,
             is_binary: true,
             strips: Vec::new(),
+            runs: Vec::new(),
         }
     }
 
@@ -245,12 +250,23 @@ impl MeasurementStudy {
         self.is_binary &= masks.iter().all(|mask| mask.is_nan() || *mask == 0.0 || *mask == 1.0);
         let masks = with_means(masks);
         let mut fine = Array2::zeros(y.dim());
+        let mut in_run = false;
         for row in (0..rows).step_by(BLOCK) {
             let place = s![.., REACH + row..REACH + row + BLOCK, REACH..REACH + columns];
             let strip = Strip::new(masks.slice(place), y.slice(s![row..row + BLOCK, ..]));
             if strip.measured.sum() == 0.0 {
+                in_run = false;
                 continue;
             }
+            let at = self.strips.len();
+            match self.runs.last_mut() {
+                Some(run) if in_run => run.strips.end = at + 1,
+                _ => {
+                    let place = [first_row + REACH + row, first_column + REACH];
+                    self.runs.push(Run { strips: at..at + 1, place });
+                }
+            }
+            in_run = true;
             let own = fine.slice_mut(s![row..row + BLOCK, ..]);
             own.into_iter().zip(&strip.y).for_each(|(fine, y)| *fine = *y);
             self.pixels += strip.measured.sum() * (BLOCK * BLOCK) as f64;
@@ -363,6 +379,7 @@ impl MeasurementStudy {
             distortion,
             alteration,
             drift,
+            unmodulated: unmodulated(&self.strips, &self.runs, &weighted),
             brightest,
             brightest_block,
             is_flat: false,
@@ -642,6 +659,7 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
             findings.extend(uneven_brightness(figures, &not_shown));
             findings.extend(missing_patterns(not_shown));
             findings.extend(unexplained_light(figures, dark_subtracted));
+            findings.extend(unmodulated_area(figures));
         }
     }
     if !has_mask_scale {
@@ -880,6 +898,16 @@ fn unexplained_light(figures: &MeasurementFigures, dark_subtracted: bool) -> Opt
     Some(Finding::new(code, observation + cause).escalate_if(share.abs() > 0.15))
 }
 
+/// Parts of the picture whose light does not follow the masks.
+fn unmodulated_area(figures: &MeasurementFigures) -> Option<Finding> {
+    let Unmodulated { share, place: [row, column] } = figures.unmodulated?;
+    let detail = format!(
+        "the masks do not modulate the light of {:.1} % of the area, for example around row {row} and column {column}",
+        100.0 * share
+    );
+    Some(Finding::new(FindingCode::UnmodulatedArea, detail))
+}
+
 /// A brightness that does not fit the full scale. A dark scene may have one small bright object.
 fn implausible_brightness(figures: &MeasurementFigures) -> Option<Finding> {
     let too_bright = figures.brightest > *PLAUSIBLE_BRIGHTNESS.end();
@@ -1109,6 +1137,33 @@ mod tests {
             assert_eq!(codes(&half, &y), ["drifted_masks"], "seed {seed}");
             let copy = masks.index_axis(ndarray::Axis(0), 3).to_owned();
             assert_eq!(codes(&masks, &copy), ["binary_measurement"], "seed {seed}");
+        }
+    }
+
+    #[test]
+    fn parts_that_the_masks_do_not_modulate_are_reported() {
+        for seed in 0..3 {
+            for masks in [
+                fine_masks(8, 140),
+                random_squares(10, 140, 140, seed).unwrap().0,
+                turning_circle(10, 140, seed),
+            ] {
+                let scene = scene(masks.dim().0, 140);
+                let y = noisy(measure(masks.view(), scene.view()).unwrap(), 0.02, seed).unwrap();
+                let place = s![24..64, 72..112];
+                let mean = y.mean().unwrap();
+                let noise = noisy(Array2::from_elem((40, 40), mean), 0.02, seed).unwrap();
+                let other = y.slice(s![80..120, 16..56]).to_owned();
+                // A reflection of a lamp that does not pass the aperture.
+                let glare = &y.slice(place) + 6.0 * mean;
+                for (name, part) in [("noise", noise), ("repeated", other), ("glare", glare)] {
+                    let mut y = y.clone();
+                    y.slice_mut(place).assign(&part);
+                    let found = codes(&masks, &y);
+                    assert!(found.contains(&"unmodulated_area"), "{name} {seed}: {found:?}");
+                }
+                assert!(codes(&masks, &y).is_empty(), "{seed}: {:?}", codes(&masks, &y));
+            }
         }
     }
 

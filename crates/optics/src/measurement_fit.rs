@@ -298,7 +298,7 @@ impl Strip {
     }
 
     /// Index of the block of each pixel.
-    fn blocks(&self) -> impl Iterator<Item = usize> {
+    pub(super) fn blocks(&self) -> impl Iterator<Item = usize> {
         let count = self.y_means.len();
         (0..self.y.len()).map(move |pixel| pixel / BLOCK % count)
     }

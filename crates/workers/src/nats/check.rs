@@ -178,13 +178,19 @@ async fn clocks(connection: &Connection, subject: &str) -> Check {
         Err(error) => Check::new(what, false, error.to_string()),
         Ok(message) => {
             let time: SystemTime = message.time.into();
-            let early = before.duration_since(time).unwrap_or_default();
-            let late = time.duration_since(after).unwrap_or_default();
-            let difference = early.max(late);
-            let text = format!("{:.1} s apart", difference.as_secs_f64());
-            Check::new(what, difference <= CLOCKS, text)
+            compared(time, before, after)
         }
     }
+}
+
+/// Compares another machine's time of an event with the local times before and after it.
+fn compared(time: SystemTime, before: SystemTime, after: SystemTime) -> Check {
+    let early = before.duration_since(time).unwrap_or_default();
+    let late = time.duration_since(after).unwrap_or_default();
+    let difference = early.max(late);
+    let hint = if difference <= CLOCKS { "" } else { ": synchronise both, for example by NTP" };
+    let text = format!("{:.1} s apart{hint}", difference.as_secs_f64());
+    Check::new("clocks", difference <= CLOCKS, text)
 }
 
 /// Checks what a worker of a pool needs.
@@ -197,7 +203,7 @@ async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<C
         device: "check".into(),
         program,
     };
-    let mut checks = vec![welcome(connection, pool, &hello).await];
+    let mut checks = welcome(connection, pool, &hello).await;
     let consumer = connection.pool(pool).await;
     checks.push(Check::of("the pool's tiles", consumer, |consumer| {
         let info = consumer.cached_info();
@@ -223,26 +229,32 @@ async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<C
     checks
 }
 
-async fn welcome(connection: &Connection, pool: &Pool, hello: &Hello) -> Check {
-    let what = "welcome";
-    let Ok(text) = serde_json::to_vec(hello) else {
-        return Check::new(what, false, "the message can't be written");
+async fn welcome(connection: &Connection, pool: &Pool, hello: &Hello) -> Vec<Check> {
+    let welcome = |good, found: String| vec![Check::new("welcome", good, found)];
+    let text = match serde_json::to_vec(hello) {
+        Ok(text) => text,
+        Err(error) => return welcome(false, format!("the message can't be written: {error}")),
     };
-    match connection.client.request(names::ask("hello", pool), text.into()).await {
-        Err(error) => Check::new(
-            what,
-            false,
-            format!("no `sci-recon serve` answers, or the credential has no right to ask: {error}"),
-        ),
-        Ok(answer) => match serde_json::from_slice(&answer.payload) {
-            Ok(HelloAnswer::Welcome { .. }) => {
-                let leave = super::message::Beat { worker: hello.worker, tile: None, leaves: true };
-                // If this fails, the hub drops the worker after a while.
-                let _ = connection.publish(names::ask("beat", pool), &leave).await;
-                Check::new(what, true, "the server takes workers of this version")
-            }
-            Ok(HelloAnswer::Refused(reason)) => Check::new(what, false, reason),
-            Err(error) => Check::new(what, false, format!("the answer can't be read: {error}")),
-        },
+    let before = SystemTime::now();
+    let answer = match connection.client.request(names::ask("hello", pool), text.into()).await {
+        Ok(answer) => answer,
+        Err(error) => {
+            let causes = "no `sci-recon serve` answers, or the credential has no right to ask";
+            return welcome(false, format!("{causes}: {error}"));
+        }
+    };
+    let after = SystemTime::now();
+    match serde_json::from_slice(&answer.payload) {
+        Ok(HelloAnswer::Welcome { now_ms, .. }) => {
+            let now = SystemTime::UNIX_EPOCH + Duration::from_millis(now_ms);
+            let leave = super::message::Beat { worker: hello.worker, tile: None, leaves: true };
+            // If this fails, the hub drops the worker after a while.
+            let _ = connection.publish(names::ask("beat", pool), &leave).await;
+            let mut checks = welcome(true, "the server takes workers of this version".into());
+            checks.push(compared(now, before, after));
+            checks
+        }
+        Ok(HelloAnswer::Refused(reason)) => welcome(false, reason),
+        Err(error) => welcome(false, format!("the answer can't be read: {error}")),
     }
 }

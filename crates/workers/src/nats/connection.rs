@@ -38,7 +38,8 @@ pub enum ClusterError {
     Unreachable { url: String, reason: String },
     #[error(
         "the NATS server at {url} refuses the credential (authorization violation): it is missing, revoked, expired, \
-        or belongs to another cluster; `sci-recon cluster worker list` shows the valid ones"
+        or belongs to another cluster (`sci-recon cluster worker list` shows the valid ones); if all credentials are \
+        refused, the NATS server has not read its configuration or its store: see its log"
     )]
     Unauthorized { url: String },
     #[error("NATS: can't {action}: {reason}")]

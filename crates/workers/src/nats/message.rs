@@ -159,8 +159,9 @@ pub struct Hello {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum HelloAnswer {
-    /// The worker is accepted. A message is redelivered after `ack_wait_ms` milliseconds without a sign of work.
-    Welcome { ack_wait_ms: u64 },
+    /// The worker is accepted. A message is redelivered after `ack_wait_ms` milliseconds without a sign of work. `now_ms` is
+    /// the time of the server in milliseconds since 1970.
+    Welcome { ack_wait_ms: u64, now_ms: u64 },
     /// The reason why the worker is refused.
     Refused(String),
 }

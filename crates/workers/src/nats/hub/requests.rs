@@ -2,7 +2,7 @@
 
 use std::future::Future;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use async_nats::{Message, Subscriber};
 use futures_util::StreamExt;
@@ -180,8 +180,9 @@ impl Core {
         lock(&self.presence).join(worker, pool);
         tracing::info!(%worker, host, %pool, "a worker has joined");
         self.more.notify_one();
-        let ack_wait_ms = u64::try_from(self.ack_wait.as_millis()).unwrap_or(u64::MAX);
-        Some(HelloAnswer::Welcome { ack_wait_ms })
+        let ms = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        Some(HelloAnswer::Welcome { ack_wait_ms: ms(self.ack_wait), now_ms: ms(now) })
     }
 
     /// Grants a worker an attempt, if no other worker owns the tile.
