@@ -200,8 +200,8 @@ findings! {
         "check the shift stated as `registration`: pixels down, then pixels to the right; or estimate it with `registration` auto";
     TurnedMasks: [Measurement], [Error],
         "the masks fit when they are flipped or their rows and columns exchanged",
-        "state the `axes` of the masks, or export masks and measurement with the same orientation, and make the \
-         calibration again";
+        "export masks and measurement with the same orientation (or state the `axes` of the masks if rows and columns are \
+         exchanged), and make the calibration again";
     ResampledMasks: [Measurement], [Error],
         "the masks have another magnification or rotation than the measurement",
         "send masks and measurement in the pixels of the camera, without resizing; if neither was resized, calibrate again \
@@ -240,7 +240,7 @@ findings! {
         "the frames do not predict pixels that were withheld from the reconstruction",
         "check that the masks belong to this measurement, unflipped and in its pixel grid, and that the measurement \
          is not mostly noise; then calibrate again";
-    ExchangedMasks: [Result], [Error],
+    ExchangedMasks: [Result], [Warning],
         "two masks are probably exchanged",
         "check that the masks are in the order in which the LCoS shows the patterns during a measurement";
 }

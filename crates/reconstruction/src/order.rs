@@ -26,10 +26,12 @@ pub enum Order {
 
 /// Side of the blocks over which steps are summed, in pixels. Neighbouring pixels change together.
 const BLOCK: usize = 8;
-/// An exchange that leaves less than this share of the steps, by this many standard errors, indicates a wrong order. Of 48
-/// static and moving scenes in the right order, the one below that share is below it by 1.2 standard errors.
+/// An exchange that leaves less than this share of the steps, by this many standard errors, and shortens blocks with this
+/// share of them, indicates a wrong order. Of 68 clips and photographs in the right order, two of a waving arm have 0.89
+/// with 0.56 and 0.60 of the steps. With two masks exchanged, all but one of those below 0.9 have 0.69 and more.
 const MUCH_SHORTER: f64 = 0.9;
 const SHORTER_T: f64 = 2.5;
+const AGREEING: f64 = 0.65;
 /// The order is consistent if each exchange lengthens the steps by this share, by this many standard errors.
 const LONGER: f64 = 1.01;
 const LONGER_T: f64 = 2.0;
@@ -68,7 +70,10 @@ impl Order {
                 is_consistent &= share > LONGER && t > LONGER_T;
                 if share < smallest {
                     smallest = share;
-                    best = (share < MUCH_SHORTER && t < -SHORTER_T).then_some((first, second));
+                    let shorter = changes.iter().zip(&before).filter(|(change, _)| **change < 0.0);
+                    let agreeing = shorter.map(|(_, b)| b).sum::<f64>() / total;
+                    let is_wrong = share < MUCH_SHORTER && t < -SHORTER_T && agreeing > AGREEING;
+                    best = is_wrong.then_some((first, second));
                 }
             }
         }

@@ -1,11 +1,13 @@
 //! A stage of a schedule: a number of iterations with one prior.
 
+use std::collections::HashMap;
 use std::sync::LazyLock;
 
 use schemars::{JsonSchema, Schema};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
+use strum::VariantNames;
 
 use super::bounds;
 use super::error::ReconError;
@@ -161,7 +163,7 @@ impl Stage {
         let name = prior_name(fields)?.ok_or("missing field `prior`")?;
         // Before the check for missing fields, because a misspelt field is also a missing one.
         let known = field_schemas(Some(name));
-        fields.keys().try_for_each(|field| known_field(&known, field))?;
+        fields.keys().try_for_each(|field| known_field(known, field))?;
         let prior = PriorSpec::read(name, fields)?;
         let projection = fields::read(fields)?;
         let Own { iterations, momentum, tolerance } = fields::read(fields)?;
@@ -179,18 +181,27 @@ fn prior_name(fields: &Fields) -> Result<Option<PriorName>, String> {
 }
 
 /// The schemas of the fields of a stage with this prior; with any prior if none is given.
-fn field_schemas(prior: Option<PriorName>) -> Fields {
-    static SCHEMA: LazyLock<Value> = LazyLock::new(|| schemars::schema_for!(Stage).to_value());
-    let alternatives = SCHEMA["oneOf"].as_array().into_iter().flatten();
+fn field_schemas(prior: Option<PriorName>) -> &'static Fields {
+    // Lists of jobs read hundreds of stages.
+    static ALL: LazyLock<HashMap<Option<&str>, Fields>> = LazyLock::new(|| {
+        let schema = schemars::schema_for!(Stage).to_value();
+        let names = PriorName::VARIANTS.iter().copied().map(Some);
+        names.chain([None]).map(|prior| (prior, select_schemas(&schema, prior))).collect()
+    });
+    &ALL[&prior.map(<&str>::from)]
+}
+
+/// The part of the schema of a stage that concerns this prior, or any if none is given.
+fn select_schemas(schema: &Value, prior: Option<&str>) -> Fields {
+    let alternatives = schema["oneOf"].as_array().into_iter().flatten();
     let possible = alternatives.filter(|alternative| {
-        let name = &alternative["properties"]["prior"]["const"];
-        prior.is_none_or(|prior| name == <&str>::from(prior))
+        prior.is_none_or(|prior| &alternative["properties"]["prior"]["const"] == prior)
     });
     let parameters = possible.filter_map(|alternative| {
         let place = alternative["$ref"].as_str()?.trim_start_matches('#');
-        SCHEMA.pointer(place)
+        schema.pointer(place)
     });
-    let parts = std::iter::once(&*SCHEMA).chain(parameters);
+    let parts = std::iter::once(schema).chain(parameters);
     let properties = parts.filter_map(|part| part["properties"].as_object());
     let own = properties.flatten().map(|(name, schema)| (name.clone(), schema.clone()));
     own.chain([("prior".to_owned(), Value::Null)]).collect()
@@ -208,7 +219,7 @@ fn known_field(known: &Fields, field: &str) -> Result<(), String> {
 fn check_field(before: &Fields, field: &str, value: Option<&Value>) -> Result<(), String> {
     let known = field_schemas(prior_name(before)?);
     match value {
-        None => known_field(&known, field),
+        None => known_field(known, field),
         Some(value) if field == "prior" => {
             PriorName::parse(value.as_str().unwrap_or_default()).map(|_| ())
         }

@@ -184,7 +184,7 @@ export function verdictOf(job, { verdict, assessment } = job) {
   const isWrong = findingsOf(job, assessment).some(({ severity }) => severity === "error");
   if (verdict === "bad" && isWrong) return [verdict, verdict, "Bad", "The checks found errors that make the frames wrong:"];
   if (verdict === "doubtful") return [verdict, verdict, "Doubtful", "The checks put the scale, the dark or the masks in doubt, and with them the frames:"];
-  return [verdict, verdict, `Likely ${verdict}`, `${limitOf(verdict, assessment)} ${LOOK[verdict === "good" ? measuredVerdict(assessment.psnr_db)[1] : verdict]}`];
+  return [verdict, verdict, `Likely ${verdict}`, `${limitOf(verdict, assessment)} ${LOOK[verdict === "bad" || assessment.psnr_db < GOOD_DB ? verdict : measuredVerdict(assessment.psnr_db)[1]]}`];
 }
 
 /** Expected PSNR in dB from which frames are good, and the upper end of the interval below which they are bad, as in the service. */

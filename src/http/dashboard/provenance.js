@@ -82,10 +82,8 @@ export function ran(job, content) {
   const { summary, schedule } = content;
   const [planned, decided] = [iterationsOf(job.schedule), iterationsOf(schedule)];
   if (decided === 0) return "one pass of the model per tile";
-  if (summary.stop_reason === "converged") {
-    return `${summary.iterations} of at most ${planned} iterations per tile, until convergence`;
-  }
-  return `${decided} of at most ${planned} iterations per tile${decided < planned ? "; the pilot predicted no gain from the others" : ""}`;
+  const why = summary.stop_reason === "converged" ? ", until convergence" : decided < planned ? "; the pilot predicted no gain from the others" : "";
+  return `${summary.iterations} iterations per tile, ${planned} planned${why}`;
 }
 
 /** Names and hashes of the networks, or "none". */

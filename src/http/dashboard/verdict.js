@@ -74,7 +74,7 @@ export class Verdict {
     put(this.expected, this.assessment && (psnr === null
       ? h("p", { class: "muted" }, "No expected PSNR and no map of the expected error: the findings put the scale, the dark or the masks in doubt.")
       : [h("p", { class: "quality" }, "Expected PSNR: about ", h("b", null, aboutDecibels(psnr))),
-          h("p", { class: "muted" }, `In four of five cases the true PSNR, relative to the white level of the frames, is ${expectedRange(this.assessment)}. Select “Expected error” above the frames to see where the error is largest.`)]),
+          h("p", { class: "muted" }, `In four of five cases the true PSNR is ${expectedRange(this.assessment)}, relative to the white level of the frames. Their absolute brightness is not judged. Select “Expected error” above the frames to see where the error is largest.`)]),
     order && h("p", { class: "muted" }, `Order of masks not verifiable: ${order}.`));
   }
 

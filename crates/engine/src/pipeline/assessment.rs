@@ -280,7 +280,8 @@ fn exchanged_masks(orders: &[Order]) -> Option<Finding> {
     let (first, second) = pair.filter(|_| common_order(orders) == Some(MaskOrder::Doubtful))?;
     let detail = format!(
         "the frames would follow one another more steadily if frames {first} and {second} (counted from 0) were \
-         exchanged: the masks are probably in a wrong order. A missing mask looks similar: count the masks first"
+         exchanged. Most likely the masks are in a wrong order or one is missing: count them first. A scene that moves \
+         to and fro looks the same"
     );
     let finding = Finding::new(FindingCode::ExchangedMasks, detail);
     Some(Finding { frames: vec![first, second], ..finding })
@@ -296,9 +297,9 @@ fn unexplained_pixels(predictions: &[Prediction]) -> Option<Finding> {
     let (frames, neighbours) = (sum(|one| one.by_frames), sum(|one| one.by_neighbours));
     (neighbours > 0.0 && frames >= MAX_UNEXPLAINED * neighbours).then(|| {
         let detail = format!(
-            "the frames predict pixels that were withheld from the reconstruction with {:.1} times the squared error \
-             of the mean of the pixels around them",
-            frames / neighbours
+            "the frames predict pixels that were withheld from the reconstruction with {:.1} times the error of the \
+             mean of the pixels around them",
+            (frames / neighbours).sqrt()
         );
         Finding::new(FindingCode::UnexplainedPixels, detail)
     })

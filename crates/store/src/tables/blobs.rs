@@ -36,12 +36,13 @@ pub struct BlobRow {
 
 from_row!(BlobRow, row => { blob = Blob::from_row(row)?, in_use });
 
-/// The condition under which something of a lab refers to an upload of its, named as columns of `h`.
+/// The condition under which something of a lab refers to an upload of its, named as columns of `h`. The sign keeps SQLite
+/// from searching everything of the lab: few rows refer to a file.
 macro_rules! in_use {
     () => {
         "(EXISTS (SELECT 1 FROM request_files AS f JOIN requests USING (id)
-                  WHERE requests.lab = h.lab AND f.sha256 = h.sha256)
-          OR EXISTS (SELECT 1 FROM jobs AS j WHERE j.lab = h.lab AND truth = h.sha256))"
+                  WHERE +requests.lab = h.lab AND f.sha256 = h.sha256)
+          OR EXISTS (SELECT 1 FROM jobs AS j WHERE +j.lab = h.lab AND truth = h.sha256))"
     };
 }
 

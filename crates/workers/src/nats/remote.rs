@@ -575,7 +575,9 @@ async fn introduce(
         }
     };
     match serde_json::from_slice(&answer) {
-        Ok(HelloAnswer::Welcome { ack_wait_ms, .. }) => Ok(Some(Duration::from_millis(ack_wait_ms))),
+        Ok(HelloAnswer::Welcome { ack_wait_ms, .. }) => {
+            Ok(Some(Duration::from_millis(ack_wait_ms)))
+        }
         Ok(HelloAnswer::Refused(reason)) => Err(ClusterError::Refused(reason)),
         Err(error) => Err(ClusterError::Refused(format!("its answer can't be read: {error}"))),
     }
