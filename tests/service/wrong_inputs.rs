@@ -340,7 +340,8 @@ async fn every_way_shows_the_same_verdict() {
         let mut submit = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         submit.arg("submit").arg(path("y.npy")).arg("--masks").arg(path("masks.npy"));
         submit.args(["--algorithm", algorithm, "--registration", "off"]);
-        let job = printed(&app, submit, 0).await;
+        let code = if expected == ["bad"] { 3 } else { 0 };
+        let job = printed(&app, submit, code).await;
         let ended = app.ended(&job).await;
         let word = ended["verdict"].as_str().unwrap();
         let text = ended["verdict_text"].as_str().unwrap();
@@ -356,7 +357,6 @@ async fn every_way_shows_the_same_verdict() {
         }
         let mut watch = Command::new(env!("CARGO_BIN_EXE_sci-recon"));
         watch.args(["watch", &job]);
-        let code = if word == "bad" { 3 } else { 0 };
         let line = printed(&app, watch, code).await;
         assert!(line.starts_with(&format!("{job}: {text}; finished")), "{line}");
         let mut client = Command::new(&python);
