@@ -76,20 +76,30 @@ impl Store {
         Ok(Forecast::new(&unfinished, labs, workers, self.rates().await?))
     }
 
-    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: the mean
-    /// over the last tasks of a kind, weighted by their real cost; 1 before there are any.
+    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: the mean over the last tasks of
+    /// a kind, weighted by their planned cost. Each kind starts with some seconds as planned, because the first tasks may be
+    /// so small that they measure the start of a process.
     async fn rates(&self) -> Result<(f64, f64)> {
+        const AS_PLANNED: (f64, f64) = (10.0, 1.0);
         let row = sql!(
-            "SELECT sum(recent_seconds) FILTER (WHERE kind = 'tile')
-                    / sum(recent_cost) FILTER (WHERE kind = 'tile') AS tiles,
-                 sum(recent_seconds) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble'))
-                    / sum(recent_cost) FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')) AS others
+            "SELECT coalesce(sum(recent_seconds) FILTER (WHERE kind = 'tile'), 0.0) AS tile_seconds,
+                 coalesce(sum(recent_cost) FILTER (WHERE kind = 'tile'), 0.0) AS tile_cost,
+                 coalesce(sum(recent_seconds)
+                     FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')), 0.0) AS other_seconds,
+                 coalesce(sum(recent_cost)
+                     FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')), 0.0) AS other_cost
              FROM totals",
         )
         .fetch_one(&self.readers)
         .await?;
-        let rate = |rate: Option<f64>| rate.filter(|rate| *rate > 0.0).unwrap_or(1.0);
-        Ok((rate(row.read("tiles")?), rate(row.read("others")?)))
+        let rate = |seconds: &'static str, cost: &'static str, start: f64| -> Result<f64> {
+            Ok((row.read::<f64>(seconds)? + start) / (row.read::<f64>(cost)? + start))
+        };
+        let (tiles, others) = AS_PLANNED;
+        Ok((
+            rate("tile_seconds", "tile_cost", tiles)?,
+            rate("other_seconds", "other_cost", others)?,
+        ))
     }
 
     /// Planned CPU-seconds left of the unfinished jobs of each lab that has any.
