@@ -142,7 +142,7 @@ RIGHT, WRONG, HIDDEN = 'right', 'wrong', 'hidden'
 @dataclasses.dataclass
 class Kind:
     """`causes` are codes of findings that name the cause, or `code: text` if the finding must contain a text, or
-    `refused: text` for an error. Those of a right kind are no false alarms. A hidden kind can't be seen in one snapshot."""
+    `refused: text` for an error. Codes of a right kind are no false alarms. A hidden kind can't be seen in one snapshot."""
     name: str
     causes: tuple
     make: callable

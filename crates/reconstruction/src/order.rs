@@ -28,7 +28,7 @@ pub enum Order {
 const BLOCK: usize = 8;
 /// An exchange that leaves less than this share of the steps, by this many standard errors, and shortens blocks with this
 /// share of them, indicates a wrong order. Of 68 clips and photographs in the right order, two of a waving arm have 0.89
-/// with 0.56 and 0.60 of the steps. With two masks exchanged, all but one of those below 0.9 have 0.69 and more.
+/// with 0.56 and 0.60 of the steps. With two masks exchanged, one of those below 0.9 has 0.60, the others at least 0.69.
 const MUCH_SHORTER: f64 = 0.9;
 const SHORTER_T: f64 = 2.5;
 const AGREEING: f64 = 0.65;
