@@ -328,7 +328,8 @@ fn agrees(stated: &Map<String, Value>, found: &Value) -> bool {
     names.all(|name| {
         let was = stated.get(name).filter(|was| !is_empty(was));
         // The `frames` of a calibration are their number, those of its `reading` the range.
-        let is = found["reading"].get(name).or_else(|| found.get(name));
+        let own = || found.get(name).filter(|_| name != "frames");
+        let is = found["reading"].get(name).or_else(own);
         match (was, is) {
             (Some(was), Some(is)) => !differs(was, is),
             (None, Some(is)) => !STATED.contains(&name) || is_empty(is),

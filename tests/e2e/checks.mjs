@@ -71,8 +71,7 @@ export class Checks {
         await page.emulateMedia({ colorScheme });
         await page.waitForTimeout(250);
         await this.accessible(page, `${name} (${width}, ${colorScheme})`);
-        await page.screenshot({ path: join(this.folder, `${name}-${width}-${colorScheme}.png`) });
-        this.screenshots += 1;
+        await this.picture(page, `${name}-${width}-${colorScheme}`);
       }
       const odd = await page.evaluate(() => {
         const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
@@ -87,6 +86,22 @@ export class Checks {
       this.that(longer <= 0, `only the content of ${name} scrolls, but the document is ${longer} pixels longer than the screen`);
     }
     await page.setViewportSize({ width: SIZES[0][0], height: SIZES[0][1] });
+  }
+
+  /** Takes a screenshot, and in the long run one of each screen below it. */
+  async picture(page, name) {
+    const scrolled = (by) => page.evaluate((by) => {
+      const content = document.querySelector("#content");
+      if (!content) return false;
+      const before = content.scrollTop;
+      content.scrollTop += by * content.clientHeight;
+      return content.scrollTop > before;
+    }, by);
+    for (let screen = 1; screen === 1 || (!process.env.SHORT && screen < 8 && (await scrolled(1))); screen += 1) {
+      await page.screenshot({ path: join(this.folder, `${name}${screen > 1 ? `-${screen}` : ""}.png`) });
+      this.screenshots += 1;
+    }
+    await scrolled(-100);
   }
 
   async accessible(page, name) {

@@ -168,6 +168,16 @@ async fn python_watches_a_folder() {
     let count = app.get("/v1/jobs").await.expect(200).json()["items"].as_array().unwrap().len();
     assert_eq!(count, 2);
     assert!(!path("drop.npz.2.result").exists() && !path("small.npy.2.failed.txt").exists());
+    // A restart before the end of a job, when the record of processed files lacks it, continues with that job.
+    std::fs::write(path(".sci-recon-watch.json"), "{}").unwrap();
+    let (status, text) = watch().await;
+    assert_eq!(status, Some(1), "{text}");
+    assert!(path("drop.npz.2.result").exists() && path("oops.npy.2.result").exists(), "{text}");
+    let count = app.get("/v1/jobs").await.expect(200).json()["items"].as_array().unwrap().len();
+    assert_eq!(count, 2, "{text}");
+    std::fs::write(path(".sci-recon-watch.json"), "{").unwrap();
+    let (_, text) = watch().await;
+    assert!(text.contains("is damaged") && !text.contains("Traceback"), "{text}");
 }
 
 /// Runs a notebook of the Python client against a service, and returns the judge's report.

@@ -192,8 +192,16 @@ pub async fn orphans(app: &mut TestApp) -> usize {
         let results = std::fs::read_dir(app.data().join("results")).unwrap().count();
         let results = results.saturating_sub(jobs);
         let surplus = count("blobs").abs_diff(known) + results + count("partial") + count("tmp");
-        if surplus == 0 || start.elapsed().as_secs() > 10 {
+        if surplus > 0 && start.elapsed().as_secs() > 10 {
+            let found = ["results", "partial", "tmp"].map(|folder| {
+                let entries = std::fs::read_dir(app.data().join(folder)).unwrap();
+                entries.map(|entry| entry.unwrap().path()).collect::<Vec<_>>()
+            });
+            eprintln!("{known} blobs are known, {} exist; {jobs} jobs; {found:#?}", count("blobs"));
             return surplus;
+        }
+        if surplus == 0 {
+            return 0;
         }
         tokio::time::sleep(Duration::from_millis(100)).await;
     }

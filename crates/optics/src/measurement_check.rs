@@ -912,7 +912,7 @@ fn unexplained_light(figures: &MeasurementFigures, dark_subtracted: bool) -> Opt
 fn unmodulated_area(figures: &MeasurementFigures) -> Option<Finding> {
     let Unmodulated { share, place: [row, column] } = figures.unmodulated?;
     let detail = format!(
-        "the masks do not modulate the light of {:.1} % of the area, for example around row {row} and column {column}",
+        "the masks hardly modulate the light of {:.1} % of the area, for example around row {row} and column {column}",
         100.0 * share
     );
     Some(Finding::new(FindingCode::UnmodulatedArea, detail))

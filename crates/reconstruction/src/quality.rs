@@ -79,6 +79,27 @@ const STRONG_SHRINKAGE: f32 = 1.0;
 /// Largest deviation of an input from its mean, in units of its scale. Fits contain no larger ones.
 const MAX_DEVIATION: f32 = 3.0;
 
+/// True if a stage with the nonlocal prior has settings of the default schedules or of a pilot.
+fn has_usual_settings(stage: &Stage) -> bool {
+    let schedule = Schedule::pnp_nonlocal();
+    let usual = schedule.stages.iter().find_map(|stage| Some((stage, stage.prior.nonlocal()?)));
+    let (Some(prior), Some((stage_of_fit, usual))) = (stage.prior.nonlocal(), usual) else {
+        return true;
+    };
+    let equal = |a: f32, b: f32| (a - b).abs() < 1e-3;
+    let is_shrinkage = |value: f32| {
+        [1.0, 4.0, 8.0].iter().any(|times| equal(value, times * usual.temporal_shrinkage))
+    };
+    let (own, fit) = (&stage.projection, &stage_of_fit.projection);
+    let most = fit.static_variance.unwrap_or_default();
+    equal(stage.momentum, stage_of_fit.momentum)
+        && equal(own.memory, fit.memory)
+        && own.static_variance.is_none_or(|variance| (0.0..=most).contains(&variance))
+        && prior.outlier_limit == usual.outlier_limit
+        && is_shrinkage(prior.temporal_shrinkage)
+        && prior.static_shrinkage.is_none_or(is_shrinkage)
+}
+
 /// The models of the file.
 struct Models {
     total_variation: Model,
@@ -100,7 +121,8 @@ static MODELS: LazyLock<Models> = LazyLock::new(|| {
 
 impl Model {
     /// The model for results of a fixed schedule, if there is one. There are models for total variation alone, and
-    /// for total variation followed by priors of the default schedule, with weak or strong temporal shrinkage.
+    /// for total variation followed by priors of the default schedule, with weak or strong temporal shrinkage. Stages with the
+    /// nonlocal prior have the settings of the fit.
     pub fn of(schedule: &Schedule) -> Option<&'static Self> {
         if schedule.method != Method::Gap {
             return None;
@@ -109,6 +131,7 @@ impl Model {
         let known = |stage: &Stage| {
             use PriorSpec::{Fastdvdnet, FastdvdnetInt8, Nonlocal};
             matches!(stage.prior, Fastdvdnet(_) | FastdvdnetInt8(_) | Nonlocal(_))
+                && has_usual_settings(stage)
         };
         if !matches!(first.prior, PriorSpec::Tv(_)) || !rest.iter().all(known) {
             return None;
@@ -448,6 +471,18 @@ mod tests {
         let has = |schedule: Schedule| Model::of(&schedule).is_some();
         assert!(has(Schedule::gap_tv()) && has(Schedule::pnp_tv_fastdvdnet()));
         assert!(!has(Schedule::admm_tv()) && !has(Schedule::pnp_ffdnet()));
+        let changes: [fn(&mut crate::stage::Stage); 4] = [
+            |stage| stage.momentum = 0.0,
+            |stage| stage.projection.static_variance = Some(1.0),
+            |stage| stage.prior.nonlocal_mut().unwrap().outlier_limit = Some(1.0),
+            |stage| stage.prior.nonlocal_mut().unwrap().temporal_shrinkage = 1.0,
+        ];
+        for change in changes {
+            let mut schedule = Schedule::pnp_nonlocal();
+            assert!(has(schedule.clone()));
+            change(&mut schedule.stages[1]);
+            assert!(!has(schedule));
+        }
         for model in [&MODELS.total_variation, &MODELS.weakly_shrunk, &MODELS.strongly_shrunk] {
             let [low, high] = model.misses.interval;
             let [lower, higher] = model.misses.unfamiliar.interval;

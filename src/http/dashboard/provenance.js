@@ -46,7 +46,7 @@ export class Made {
       ["Full scale", fullScale === 1 ? "1: the values of the file are multiples of it" : `${exact(fullScale)} counts: what one frame adds where mask and scene are 1`],
       ["White level", `${inUnits(white, fullScale)}: white in pictures, and the peak of the PSNR`],
       ...times(job, whole.run),
-      ["Memory", bytes(whole.run.peak_rss_bytes)],
+      ["Memory of the worker", bytes(whole.run.peak_rss_bytes)],
       ["Residual ‖y − Hx‖ / ‖y‖", figure(content.summary.residual)],
     ]), h("p", { class: "muted" }, RESIDUAL),
     h("details", null, h("summary", null, "Full manifest"),
@@ -82,8 +82,8 @@ export function ran(job, content) {
   const { summary, schedule } = content;
   const [planned, decided] = [iterationsOf(job.schedule), iterationsOf(schedule)];
   if (decided === 0) return "one pass of the model per tile";
-  const why = summary.stop_reason === "converged" ? ", until convergence" : decided < planned ? "; the pilot predicted no gain from the others" : "";
-  return `${summary.iterations} iterations per tile, ${planned} planned${why}`;
+  const why = summary.stop_reason === "converged" ? "; converged" : decided < planned ? "; the pilot predicted no gain from the others" : "";
+  return `${summary.iterations} of ${planned} planned iterations per tile${why}`;
 }
 
 /** Names and hashes of the networks, or "none". */

@@ -38,7 +38,7 @@ function askArray(error, file, again) {
     picture.addEventListener("error", () => picture.replaceWith(h("span", { class: "blank" })));
     return h("button", { type: "button", class: "arraychoice", onclick: () => again(name) }, picture, h("b", null, name), " ", h("span", { class: "muted" }, size?.replaceAll("x", " × ")));
   };
-  return arrays.length > 0 && ask("Array", "Which array of the file is it?", arrays.map(choice));
+  return arrays.length > 0 && ask("Array", "Which array of the file?", arrays.map(choice));
 }
 
 /** Settings that an error names: by a JSON pointer, or in backticks in its text. */

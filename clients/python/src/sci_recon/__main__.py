@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ._client import Client
+from ._errors import SciReconError
 from ._watch import FILES, Watch, submitter
 
 # Keywords of `Client.reconstruct` that are not options of the command.
@@ -133,7 +135,13 @@ def main(line: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # Consoles with a legacy code page lack characters of names.
+            stream.reconfigure(errors="backslashreplace")
     try:
         sys.exit(main())
     except KeyboardInterrupt:
         pass
+    except SciReconError as error:
+        sys.exit(f"sci_recon: {error}")

@@ -186,6 +186,7 @@ class Client:
         dispersion: Mapping[str, Any] | None = None,
         bad_pixels: Source | None = None,
         name: str | None = None,
+        key: str | None = None,
     ) -> Calibration:
         """Creates a calibration from masks [B, H, W]. A colour sensor has a `mosaic`.
 
@@ -194,7 +195,8 @@ class Client:
 
         `array` is the name of the masks in a file of several arrays. `crop` selects a window with `row`, `column`, `height`
         and `width`. `frames` selects the first and the last mask, counted from 0. `packing` is "mono12p" or "mono12packed"
-        if two 12-bit pixels are stored in 3 bytes. `bad_pixels` [H, W] is nonzero at bad pixels.
+        if two 12-bit pixels are stored in 3 bytes. `bad_pixels` [H, W] is nonzero at bad pixels. A repeated request with the
+        same `key` returns the calibration of the first one.
         """
         given: Record = {
             "full_scale": full_scale,
@@ -208,7 +210,7 @@ class Client:
             "name": name,
             "bad_pixels": None if bad_pixels is None else self.upload(bad_pixels),
         }
-        record = self._create("calibrations", masks=self.upload(masks), **given)
+        record = self._create("calibrations", key=key, masks=self.upload(masks), **given)
         return Calibration(self, record).ready()
 
     def calibrate_captures(

@@ -1,8 +1,8 @@
 """A watched folder on any operating system: each new file in the folder becomes a job.
 
 The folder is listed every second. Its file `.sci-recon-watch.json` records the processed files. A file is identified by its
-name, size and modification time. The idempotency keys of requests are derived from these, so that each file becomes a
-single job even if the program is restarted.
+name, size and modification time. The idempotency keys of requests are derived from these and from the calibration, so that
+each file becomes a single job even if the program is restarted. The key of the calibration is derived from its masks.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ FILES = ("frames.npy", "stack.tif", "manifest.json")
 Submit = Callable[[Path, str], Job]
 
 
+def digest(text: str) -> str:
+    """An idempotency key."""
+    return "watch-" + hashlib.sha256(text.encode()).hexdigest()
+
+
 class Watch:
     """Watches `folder`. `submit` creates a job from file NAME. Its result `files` and a REPORT.txt are saved in NAME.result.
 
@@ -67,13 +72,25 @@ class Watch:
             raise SciReconError(
                 f"{self.folder} is watched by `sci-recon watch-folder`: use one of both, or remove {OTHER_LEDGER}"
             )
-        ledger = self.folder / LEDGER
-        self.done: dict[str, str] = json.loads(ledger.read_text("utf-8")) if ledger.exists() else {}
+        self.done = self._ledger()
         self.jobs: dict[str, tuple[Path, Job]] = {}
         # Names of skipped files that were reported.
         self.skipped: set[str] = set()
         # Files that may still change, with the time at which they were first listed.
         self.settling: dict[str, float] = {}
+
+    def _ledger(self) -> dict[str, str]:
+        """The processed files of earlier runs."""
+        ledger = self.folder / LEDGER
+        if not ledger.exists():
+            return {}
+        try:
+            done: dict[str, str] = dict(json.loads(ledger.read_text("utf-8")))
+        except (ValueError, TypeError) as error:
+            raise SciReconError(
+                f"{ledger} is damaged ({error}): remove it, and move files that have results out of the folder"
+            ) from None
+        return done
 
     def run(self, once: bool = False) -> None:
         """Watches until it is interrupted. With `once` it returns when all files are processed; `failed` and `bad` are
@@ -138,7 +155,7 @@ class Watch:
         except FileNotFoundError:
             return None
         text = f"{path.name} {meta.st_size} {meta.st_mtime_ns}"
-        return "watch-" + hashlib.sha256(text.encode()).hexdigest() if meta.st_size else None
+        return digest(text) if meta.st_size else None
 
     @staticmethod
     def _trouble(name: str) -> str | None:
@@ -198,18 +215,18 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
     """Creates the calibration, and returns a function that submits files. `options` are keywords of `Client.reconstruct`."""
     shared = ("full_scale", "array", "axes", "crop", "frames", "packing", "name")
     mask_options = {f"masks_{keyword}": keyword for keyword in shared}
-    calibration = client.calibrate(
-        masks,
-        mosaic=options.pop("mosaic", None),
-        dispersion=options.pop("dispersion", None),
-        bad_pixels=options.pop("bad_pixels", None),
-        **{keyword: options.pop(option, None) for option, keyword in mask_options.items()},
-    )
+    given = {name: options.pop(name, None) for name in ("mosaic", "dispersion", "bad_pixels")}
+    given |= {keyword: options.pop(option, None) for option, keyword in mask_options.items()}
+    # A restarted program continues with the same calibration.
+    uploads = [client.upload(file) for file in (masks, given["bad_pixels"]) if file is not None]
+    calibration = client.calibrate(masks, key=digest(f"{uploads} {sorted(given.items())}"), **given)
     job_options = set(inspect.signature(Client.submit).parameters) - {"self", "measurement", "sequence", "key"}
     job = {name: value for name, value in options.items() if name in job_options}
     measurement = {name: value for name, value in options.items() if name not in job_options}
 
     def submit(path: Path, key: str) -> Job:
+        # The body of a request with this key names the calibration.
+        key = digest(f"{key} {calibration.id}")
         taken = client.measure(calibration, path, key=key, **measurement)
         return client.submit(taken, key=key, **{"label": path.name[:200], **job})
 
