@@ -78,6 +78,9 @@ pub(crate) fn check_type(field: &str, value: &Value, schema: &Value) -> Result<(
         let types = types.join(" or ");
         return Err(format!("{field}: invalid type: {value}, expected {types}"));
     }
+    if value.as_f64().is_some_and(|value| value.abs() > f64::from(f32::MAX)) {
+        return Err(format!("{field}: {value} is out of range"));
+    }
     let Value::Array(items) = value else { return Ok(()) };
     let length = |bound: &str| schema[bound].as_u64();
     if length("minItems").is_some_and(|least| (items.len() as u64) < least)

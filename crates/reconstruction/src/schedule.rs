@@ -241,6 +241,19 @@ mod tests {
     }
 
     #[test]
+    fn numbers_beyond_32_bits_are_refused() {
+        for (field, value) in
+            [("gamma", "1e308"), ("static_variance", "-1e308"), ("momentum", "1e39")]
+        {
+            let text = format!(
+                r#"{{"stages":[{{"prior":"nonlocal","sigma":[0.1,0.01],"iterations":9,"{field}":{value}}}]}}"#
+            );
+            let error = serde_json::from_str::<Schedule>(&text).unwrap_err().to_string();
+            assert!(error.contains(field) && error.contains("out of range"), "{error}");
+        }
+    }
+
+    #[test]
     fn sigma_falls_geometrically_from_first_to_last() {
         let schedule = Schedule::pnp_fastdvdnet();
         let stage = &schedule.stages[1];

@@ -195,7 +195,7 @@ fn field_schemas(prior: Option<PriorName>) -> &'static Fields {
 fn select_schemas(schema: &Value, prior: Option<&str>) -> Fields {
     let alternatives = schema["oneOf"].as_array().into_iter().flatten();
     let possible = alternatives.filter(|alternative| {
-        prior.is_none_or(|prior| &alternative["properties"]["prior"]["const"] == prior)
+        prior.is_none_or(|prior| alternative["properties"]["prior"]["const"] == prior)
     });
     let parameters = possible.filter_map(|alternative| {
         let place = alternative["$ref"].as_str()?.trim_start_matches('#');

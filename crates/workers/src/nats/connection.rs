@@ -106,7 +106,7 @@ impl Credential {
 /// Addresses of the message server, and the credential for it.
 #[derive(Debug, Clone)]
 pub struct Access {
-    /// The addresses as the user wrote them, separated by commas.
+    /// The addresses for messages, without passwords, separated by commas.
     urls: String,
     servers: Vec<ServerAddr>,
     options: ConnectOptions,
@@ -173,7 +173,8 @@ impl Access {
         if let Some(file) = &authority {
             options = options.add_root_certificates(file.path().to_owned());
         }
-        Ok(Self { urls: urls.to_owned(), servers: servers?, options, authority, refusals })
+        let shown: Vec<String> = urls.split(',').map(without_password).collect();
+        Ok(Self { urls: shown.join(","), servers: servers?, options, authority, refusals })
     }
 
     /// Connects to one of the servers.
@@ -229,6 +230,12 @@ impl Connection {
     }
 }
 
+/// An address without the name and the password of a user.
+fn without_password(url: &str) -> String {
+    let (scheme, rest) = url.split_once("://").unwrap_or(("nats", url));
+    rest.rsplit_once('@').map_or_else(|| url.to_owned(), |(_, host)| format!("{scheme}://{host}"))
+}
+
 fn count_refusals(refusals: &AtomicU32, event: &Event) {
     // The client reports the kind of the error as text.
     let refused = ConnectErrorKind::AuthorizationViolation.to_string();
@@ -252,7 +259,19 @@ fn log(event: &Event) {
 
 #[cfg(test)]
 mod tests {
-    use super::Credential;
+    use super::{Credential, without_password};
+
+    #[test]
+    fn messages_have_no_passwords() {
+        for (url, shown) in [
+            ("nats://user:secret@host:4222", "nats://host:4222"),
+            ("user:se@cret@host", "nats://host"),
+            ("tls://host:4222", "tls://host:4222"),
+            ("host", "host"),
+        ] {
+            assert_eq!(without_password(url), shown);
+        }
+    }
 
     #[test]
     fn a_credential_file_contains_all_settings_of_a_worker() {
