@@ -546,6 +546,13 @@ mod tests {
         }
     }
 
+    /// Corrected calibrations, and those of captures, were not read from one file of masks.
+    #[test]
+    fn a_calibration_without_a_reading_agrees_whatever_its_number_of_frames() {
+        let found = json!({"frames": 8, "reading": null, "bad_pixels": null});
+        assert!(super::agrees(json!({"registration_of": "a"}).as_object().unwrap(), &found));
+    }
+
     #[test]
     fn other_files_are_refused_with_what_to_give() {
         let folder = tempfile::tempdir().unwrap();
