@@ -58,7 +58,7 @@ function reason(found) {
 function rounded(value, error) {
   if (!error) return figure(value, 5);
   const places = Math.min(6, Math.max(0, Math.ceil(-Math.log10(error))));
-  return `${value.toFixed(places)} ± ${error.toFixed(places)}`;
+  return `${value.toFixed(places)} ± ${error.toFixed(places)}`;
 }
 
 /** { shift: [1.59, -1.2], rotation: 0.1, scale: 1 } -> "by 1.59 pixels downwards and 1.2 pixels to the left, and turned by 0.1° clockwise" */
