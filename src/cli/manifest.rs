@@ -548,7 +548,7 @@ mod tests {
 
     /// Corrected calibrations, and those of captures, were not read from one file of masks.
     #[test]
-    fn a_calibration_without_a_reading_agrees_whatever_its_number_of_frames() {
+    fn calibrations_without_a_reading_agree() {
         let found = json!({"frames": 8, "reading": null, "bad_pixels": null});
         assert!(super::agrees(json!({"registration_of": "a"}).as_object().unwrap(), &found));
     }

@@ -277,12 +277,12 @@ impl Dispersion {
 
     /// True if a finding can be right about a spectral camera. It has one mask for all bands, so findings that compare
     /// separate masks or look for motion do not apply. The colour of a scene varies from place to place, which looks like an
-    /// offset that the masks do not explain.
+    /// offset that the masks do not explain, and like missing modulation.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
             DeadPixels, ExchangedMasks, FastMotion, MaskValues, MissingMask, MissingPattern,
             NegativeOffset, NoDark, OneDimensional, RepeatedPattern, ResampledMasks, StuckPixels,
-            SwappedOrder, UnevenPatterns, WrongDark,
+            SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
         };
         !matches!(
             code,
@@ -300,6 +300,7 @@ impl Dispersion {
                 | StuckPixels
                 | SwappedOrder
                 | UnevenPatterns
+                | UnmodulatedArea
                 | WrongDark
         )
     }

@@ -26,7 +26,7 @@ const MIN_MEASURED: f64 = 0.5;
 /// Consecutive strips of a window.
 #[derive(Debug)]
 pub(super) struct Run {
-    /// Their indices.
+    /// The indices of these strips in the study.
     pub(super) strips: Range<usize>,
     /// Row and column of its first pixel.
     pub(super) place: [usize; 2],
@@ -133,7 +133,9 @@ pub(super) fn unmodulated(strips: &[Strip], runs: &[Run], fit: &Fit) -> Option<U
     };
     let [light, modulation] = [mean(|sums| sums.light), mean(|sums| sums.modulation)];
     let enough = |sums: &Sums| {
-        sums.light > ENOUGH * light && sums.modulation > ENOUGH * modulation && sums.predicted > 0.0
+        sums.light > ENOUGH * light.max(0.0)
+            && sums.modulation > ENOUGH * modulation
+            && sums.predicted > 0.0
     };
     let judged = || places.iter().filter(|(_, sums)| enough(sums));
     let ratios = judged().map(|(place, sums)| {

@@ -353,7 +353,7 @@ function costs(found) {
   return facts([
     ["Done", `${when}${found.queue_position > 1 ? `, position ${found.queue_position} in the queue` : ""}`],
     ["CPU time", `up to about ${roughly(found.cpu_seconds)}, ${found.tiles} ${found.tiles === 1 ? "tile" : "tiles"}`],
-    ["Memory", `${bytes(found.worker_memory_bytes)} beside the program`],
+    ["Memory", `${bytes(found.worker_memory_bytes)} without the program`],
     ["Disk", `at most ${bytes(found.disk_bytes)}`],
   ]);
 }

@@ -36,9 +36,15 @@ FILES = ("frames.npy", "stack.tif", "manifest.json")
 Submit = Callable[[Path, str], Job]
 
 
-def digest(text: str) -> str:
-    """An idempotency key."""
-    return "watch-" + hashlib.sha256(text.encode()).hexdigest()
+def digest(*parts: object) -> str:
+    """An idempotency key that is derived from these parts."""
+    return "watch-" + hashlib.sha256(" ".join(map(str, parts)).encode()).hexdigest()
+
+
+def identity(path: Path) -> str:
+    """Identifies a file and its present content. The text is empty for an empty file."""
+    meta = path.stat()
+    return f"{path.name} {meta.st_size} {meta.st_mtime_ns}" if meta.st_size else ""
 
 
 class Watch:
@@ -151,11 +157,10 @@ class Watch:
                 print(f"{shown} is skipped: {trouble}; rename the file", flush=True)
             return None
         try:
-            meta = path.stat()
+            text = identity(path)
         except FileNotFoundError:
             return None
-        text = f"{path.name} {meta.st_size} {meta.st_mtime_ns}"
-        return digest(text) if meta.st_size else None
+        return digest(text) if text else None
 
     @staticmethod
     def _trouble(name: str) -> str | None:
@@ -218,15 +223,15 @@ def submitter(client: Client, masks: str, options: dict[str, Any]) -> Submit:
     given = {name: options.pop(name, None) for name in ("mosaic", "dispersion", "bad_pixels")}
     given |= {keyword: options.pop(option, None) for option, keyword in mask_options.items()}
     # A restarted program continues with the same calibration.
-    uploads = [client.upload(file) for file in (masks, given["bad_pixels"]) if file is not None]
-    calibration = client.calibrate(masks, key=digest(f"{uploads} {sorted(given.items())}"), **given)
+    files = [identity(Path(file)) for file in (masks, given["bad_pixels"]) if file is not None]
+    calibration = client.calibrate(masks, key=digest(files, sorted(given.items())), **given)
     job_options = set(inspect.signature(Client.submit).parameters) - {"self", "measurement", "sequence", "key"}
     job = {name: value for name, value in options.items() if name in job_options}
     measurement = {name: value for name, value in options.items() if name not in job_options}
 
     def submit(path: Path, key: str) -> Job:
         # The body of a request with this key names the calibration.
-        key = digest(f"{key} {calibration.id}")
+        key = digest(key, calibration.id)
         taken = client.measure(calibration, path, key=key, **measurement)
         return client.submit(taken, key=key, **{"label": path.name[:200], **job})
 

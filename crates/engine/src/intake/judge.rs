@@ -97,8 +97,6 @@ pub fn judge(
             // Neighbouring bands resemble one another, so the right masks explain hardly more than displaced ones.
             figures.drift[usize::from(dispersion.axis == DispersionAxis::Column)].excess = 0.0;
             (figures.distortion, figures.alteration) = (None, None);
-            // The colour of a scene varies from place to place, and with it the modulation.
-            figures.unmodulated = None;
         }
         if let Some(part) = figures.unmodulated.as_mut().filter(|_| mosaic.is_some()) {
             part.place = part.place.map(|at| 2 * at);
