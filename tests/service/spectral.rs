@@ -33,9 +33,20 @@ struct Lab {
 
 impl Lab {
     fn new(axis: &str, offsets: &str, mask: &str) -> Self {
+        Self::of(SIDE, radiance, axis, offsets, mask)
+    }
+
+    /// A lab with a scene of this side, given by its value at (band, row, column).
+    fn of(
+        side: usize,
+        radiance: impl Fn(usize, usize, usize) -> f32,
+        axis: &str,
+        offsets: &str,
+        mask: &str,
+    ) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        let pixel = |at: usize| radiance(at / (SIDE * SIDE), at / SIDE % SIDE, at % SIDE);
-        let cube = npy(&[BANDS, SIDE, SIDE], (0..BANDS * SIDE * SIDE).map(pixel));
+        let pixel = |at: usize| radiance(at / (side * side), at / side % side, at % side);
+        let cube = npy(&[BANDS, side, side], (0..BANDS * side * side).map(pixel));
         std::fs::write(folder.path().join("cube.npy"), cube).unwrap();
         let lab = Self { folder, dispersion: Value::Null };
         let output = lab.command(
@@ -210,6 +221,55 @@ async fn fractions_rows_and_masks_of_the_measurement_are_reconstructed() {
         let cube = values(&std::fs::read(lab.path("out/frames.npy")).unwrap());
         let truth = values(&lab.file("truth.npy"));
         assert!((psnr(&cube, &truth) - report["psnr_unit_db"].as_f64().unwrap()).abs() < 1.0);
+    }
+}
+
+#[tokio::test]
+async fn wrong_masks_of_a_dark_scene_are_errors() {
+    let side = 160;
+    // Three coloured discs that cover a tenth of the picture.
+    let spots = |band: usize, row: usize, column: usize| {
+        let disc = |i: f32, j: f32, colour: f32| {
+            let inside = (row as f32 - i).hypot(column as f32 - j) < 17.0;
+            let spectrum = (-((band as f32 - colour) / 2.5).powi(2)).exp();
+            if inside { 0.8 * spectrum } else { 0.0 }
+        };
+        disc(50.0, 50.0, 1.0) + disc(84.0, 100.0, 4.0) + disc(110.0, 60.0, 6.5)
+    };
+    let lab = Lab::of(side, spots, "column", "0:2:8", "scene");
+    let app = TestApp::start().await;
+    let mask = values(&lab.file("masks.npy"));
+    let measured = async |place: &dyn Fn(usize, usize) -> (usize, usize)| {
+        let pixel = |at: usize| {
+            let (row, column) = place(at / side, at % side);
+            mask[row.min(side - 1) * side + column.min(side - 1)]
+        };
+        let masks = app.upload(npy(&[1, side, side], (0..side * side).map(pixel))).await;
+        let body = json!({"masks": masks, "dispersion": lab.dispersion});
+        let calibration = id(&app.post("/v1/calibrations", &body).await.expect(201));
+        let created = app.measure(&calibration, lab.file("measurement.npy")).await.expect(201);
+        let warnings = created.json()["warnings"].as_array().unwrap().clone();
+        let errors = warnings.iter().filter(|warning| warning["severity"] == "error");
+        errors.map(|error| error["code"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(measured(&|row, column| (row, column)).await, [""; 0], "right");
+    let wrong: [(&str, &dyn Fn(usize, usize) -> (usize, usize)); 4] = [
+        ("flipped left to right", &|row, column| (row, side - 1 - column)),
+        ("flipped upside down", &|row, column| (side - 1 - row, column)),
+        ("shifted by one row", &|row, column| (row + 1, column)),
+        ("shifted by one column", &|row, column| (row, column + 1)),
+    ];
+    for (name, place) in wrong {
+        let errors = measured(place).await;
+        println!("{name}: {errors:?}");
+        let expected: &[&str] = match name.starts_with("shifted") {
+            true => &["shifted_masks"],
+            false => &["foreign_masks", "turned_masks"],
+        };
+        assert!(
+            errors.first().is_some_and(|code| expected.contains(&code.as_str())),
+            "{name}: {errors:?}"
+        );
     }
 }
 

@@ -280,15 +280,17 @@ impl Dispersion {
     /// offset that the masks do not explain, and like missing modulation.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
-            DeadPixels, ExchangedMasks, FastMotion, MaskValues, MissingMask, MissingPattern,
-            NegativeOffset, NoDark, OneDimensional, RepeatedPattern, ResampledMasks, StuckPixels,
-            SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
+            DeadPixels, DriftedMasks, ExchangedMasks, FastMotion, ForeignMasks, MaskValues,
+            MissingMask, MissingPattern, NegativeOffset, NoDark, OneDimensional, RepeatedPattern,
+            ResampledMasks, StuckPixels, SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
         };
         !matches!(
             code,
             DeadPixels
+                | DriftedMasks
                 | ExchangedMasks
                 | FastMotion
+                | ForeignMasks
                 | MaskValues
                 | MissingMask
                 | MissingPattern

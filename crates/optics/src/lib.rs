@@ -7,6 +7,7 @@
 #![warn(missing_docs)]
 
 mod axis;
+mod block_fit;
 mod calibration;
 mod calibration_check;
 mod camera;
@@ -32,6 +33,7 @@ mod simulate;
 mod squares;
 mod study;
 
+pub use block_fit::{BLOCK_MARGIN, BlockFit, BlockStudy, judge_blocks};
 pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
 pub use calibration_check::{CaptureFigures, PatternFigures, judge_captures, judge_masks};
 pub use camera::{Camera, illumination};

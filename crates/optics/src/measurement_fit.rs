@@ -404,7 +404,7 @@ pub(super) fn block_centred(
 
 /// Inverse of a symmetric positive matrix by Gauss-Jordan elimination. A millionth of the mean diagonal is added first,
 /// so that highly correlated masks do not make the matrix singular. `None` if the matrix is 0.
-fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
+pub(super) fn inverse(matrix: &Array2<f64>) -> Option<Array2<f64>> {
     let size = matrix.nrows();
     let ridge = matrix.diag().sum() / size as f64 * 1e-6;
     if ridge.is_nan() || ridge <= 0.0 {

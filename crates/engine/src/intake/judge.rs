@@ -5,12 +5,12 @@ use std::path::Path;
 
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
-use crate::job::{Dispersion, DispersionAxis, Finding, FindingCode, Mosaic};
+use crate::job::{Dispersion, Finding, FindingCode, Mosaic};
 use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use optics::{
-    Displacement, Magnified, MeasurementFigures, MeasurementStudy, REACH, central, displacement,
-    judge_measurement, magnification, magnified, with_means,
+    BLOCK_MARGIN, BlockStudy, Displacement, Magnified, MeasurementFigures, MeasurementStudy, REACH,
+    central, displacement, judge_blocks, judge_measurement, magnification, magnified, with_means,
 };
 
 /// Side of a checked window without its margin, in pixels.
@@ -93,9 +93,7 @@ pub fn judge(
         let snapshot = sample * count / count.min(SNAPSHOTS);
         let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
         let Some(mut figures) = studied.finish() else { continue };
-        if let Some(dispersion) = dispersion {
-            // Neighbouring bands resemble one another, so the right masks explain hardly more than displaced ones.
-            figures.drift[usize::from(dispersion.axis == DispersionAxis::Column)].excess = 0.0;
+        if dispersion.is_some() {
             (figures.distortion, figures.alteration) = (None, None);
         }
         if let Some(part) = figures.unmodulated.as_mut().filter(|_| mosaic.is_some()) {
@@ -120,6 +118,11 @@ pub fn judge(
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
         judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
+        let places = [FindingCode::TurnedMasks, FindingCode::ShiftedMasks];
+        if dispersion.is_some() && !judged.iter().any(|finding| places.contains(&finding.code)) {
+            let fit = block_study((&masks, &snapshots), snapshot)?.finish();
+            judged.splice(0..0, fit.as_ref().and_then(judge_blocks));
+        }
         let judged = judged.into_iter();
         findings
             .extend(judged.map(|finding| Finding { snapshot: number, ..Finding::from(finding) }));
@@ -389,6 +392,38 @@ fn study(
             let y = snapshots.read_lattice(snapshot..snapshot + 1, place, step)?;
             let first = (rows.start, columns.start);
             study.add(band.view(), y.index_axis(Axis(0), 0), first);
+        }
+    }
+    Ok(study)
+}
+
+/// Side of a window of blocks without its margin, in pixels, and number of these windows along each side.
+const BLOCK_WINDOW: usize = 256;
+const BLOCK_WINDOWS: usize = 3;
+
+/// Fits the blocks of windows that are spread evenly over a snapshot.
+fn block_study(
+    (masks, snapshots): (&Reader, &Reader),
+    snapshot: usize,
+) -> Result<BlockStudy, FormatError> {
+    let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
+    let windows = |length: usize| {
+        let inner = length.saturating_sub(2 * BLOCK_MARGIN);
+        let count = inner.div_ceil(BLOCK_WINDOW).clamp(1, BLOCK_WINDOWS);
+        let side = inner.div_ceil(count).min(BLOCK_WINDOW);
+        let start = move |index: usize| match count {
+            1 => 0,
+            _ => index * (inner - side) / (count - 1),
+        };
+        (0..count)
+            .map(move |index| start(index)..(start(index) + side + 2 * BLOCK_MARGIN).min(length))
+    };
+    let mut study = BlockStudy::default();
+    for rows in windows(height) {
+        for columns in windows(width) {
+            let band = masks.read_window(0..frames, rows.clone(), columns.clone())?;
+            let y = snapshots.read_window(snapshot..snapshot + 1, rows.clone(), columns)?;
+            study.add(band.view(), y.index_axis(Axis(0), 0));
         }
     }
     Ok(study)
