@@ -214,8 +214,8 @@ findings! {
         "send one mask for each frame of the exposure, in the order in which the patterns are shown; if none is missing, \
          record the dark frames again";
     UnmodulatedArea: [Measurement], [Warning],
-        "the masks hardly modulate the light of a part of the picture",
-        "look there for glare, a reflection, or a part of the sensor that repeats old values; if it can't be removed, \
+        "the masks modulate the light of a part of the picture too weakly",
+        "look there for glare, a reflection, stray light, or a part of the sensor that repeats old values; if it can't be removed, \
          mark the part in the map of `bad_pixels` of the calibration";
     ForeignMasks: [Measurement], [Error],
         "the masks do not explain the measurement",
