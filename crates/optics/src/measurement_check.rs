@@ -387,7 +387,7 @@ impl MeasurementStudy {
             moved_parts: moved_parts(&parts),
             alteration,
             drift,
-            unmodulated: unmodulated(&self.strips, &self.runs, &weighted),
+            unmodulated: unmodulated(&self.strips, &self.runs, &fit.brightness, weighted.offset),
             brightest,
             brightest_block,
             is_flat: false,
@@ -669,8 +669,9 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
             let not_shown = dark_frames(figures);
             findings.extend(uneven_brightness(figures, &not_shown));
             findings.extend(missing_patterns(not_shown));
-            findings.extend(unexplained_light(figures, dark_subtracted));
+            // Stray light in a part of the picture also looks like an offset.
             findings.extend(unmodulated_area(figures));
+            findings.extend(unexplained_light(figures, dark_subtracted));
         }
     }
     if !has_mask_scale {
@@ -1204,7 +1205,7 @@ mod tests {
                 // A reflection of a lamp that does not pass the aperture.
                 let glare = &y.slice(place) + 6.0 * mean;
                 let stuck = &noise * 0.06;
-                // Light from beside the lens, brightest in the middle.
+                // A smooth spot of light that passes by the masks.
                 let veil = Array2::from_shape_fn((140, 140), |(i, j)| {
                     let distance = (i as f32 - 70.0).hypot(j as f32 - 70.0);
                     mean * (-0.5 * (distance / 18.0).powi(2)).exp()
