@@ -409,7 +409,7 @@ KINDS = [
     Kind('masks shifted by 2 pixels', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, 2, axis=2)), masks=True),
     Kind('masks shifted by 3 rows and 4 columns', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, (3, -4), axis=(1, 2))), masks=True),
     Kind('crop that begins 8 rows and 20 columns away', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, (-8, 20), axis=(1, 2))), masks=True),
-    Kind('masks shifted by 1 pixel in one half', ('shifted_masks',), with_masks(moved_in_half), masks=True),
+    Kind('masks shifted by 1 pixel in one half', ('partly_moved_masks',), with_masks(moved_in_half), masks=True),
     Kind('drift by half a pixel', ('drifted_masks',), with_masks(lambda s: moved(s.masks, 0, .5)), masks=True),
     Kind('drift by 0.35 rows and 0.35 columns', ('drifted_masks',), with_masks(lambda s: moved(s.masks, .35, .35)), masks=True),
     Kind('masks resampled by 1 %', ('resampled_masks',), with_masks(lambda s: zoomed(s.masks, 1.01)), masks=True),

@@ -287,7 +287,7 @@ fn masks_that_moved_in_one_half_are_named() {
     let source = |at: usize| if at % PIXELS < PIXELS / 2 { at } else { at - 1 };
     let moved: Vec<f32> = (0..masks.len()).map(|at| masks[source(at)]).collect();
     let (assessment, codes) = reconstruct(&moved, &y);
-    assert_eq!(codes[0], "shifted_masks", "{codes:?}");
+    assert_eq!(codes[0], "partly_moved_masks", "{codes:?}");
     assert_eq!(assessment["psnr_db"], Value::Null);
 }
 

@@ -281,8 +281,8 @@ impl Dispersion {
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
             DeadPixels, ExchangedMasks, FastMotion, MaskValues, MissingMask, MissingPattern,
-            NegativeOffset, NoDark, OneDimensional, RepeatedPattern, ResampledMasks, StuckPixels,
-            SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
+            NegativeOffset, NoDark, OneDimensional, PartlyMovedMasks, RepeatedPattern,
+            ResampledMasks, StuckPixels, SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
         };
         !matches!(
             code,
@@ -295,6 +295,7 @@ impl Dispersion {
                 | NegativeOffset
                 | NoDark
                 | OneDimensional
+                | PartlyMovedMasks
                 | RepeatedPattern
                 | ResampledMasks
                 | StuckPixels

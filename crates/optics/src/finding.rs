@@ -187,6 +187,10 @@ findings! {
         "the masks fit better when shifted (by up to 32 pixels)",
         "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
          calibration: calibrate again (a job with `registration` auto corrects up to 4 pixels)";
+    PartlyMovedMasks: [Measurement], [Error],
+        "the masks are displaced in a part of the picture",
+        "check that the sensor is read in the same way as during the calibration, and that neither masks nor measurement \
+         were put together from parts; then calibrate again";
     DriftedMasks: [Measurement], [Warning],
         "the masks are displaced by a fraction of a pixel",
         "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
@@ -278,6 +282,7 @@ impl FindingCode {
             | Self::Negative
             | Self::NegativeOffset
             | Self::NoDark
+            | Self::PartlyMovedMasks
             | Self::ResampledMasks
             | Self::ShiftedMasks
             | Self::TurnedMasks

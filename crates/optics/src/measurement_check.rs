@@ -38,9 +38,9 @@ const LOCAL_MOSAIC_SIGNIFICANCE: f64 = 5.0;
 const MAX_GREEN_DIFFERENCE: f64 = 0.25;
 /// A drift is reported if neighbouring displacements differ by this much; see [`Drift`]. Of 176 scenes, right masks stay below
 /// 0.17 and 0.49, also after a blur of 0.6 pixels. Independent masks that drift by a quarter of a pixel exceed 0.2, and others
-/// that drift by 0.35 pixels along both axes 0.55.
+/// that drift by 0.35 pixels along both axes 0.55. Behind a rotating circle, light that fades to a fifth gives 0.53.
 const MIN_DRIFT: f64 = 0.2;
-const MIN_DRIFT_EXCESS: f64 = 0.52;
+const MIN_DRIFT_EXCESS: f64 = 0.54;
 /// Frames differ in brightness from this share of their mean on, and from this many standard errors on. Of 37 simulated
 /// scenes, right masks have at most 2.8 standard errors. A missing mask that resembles the others mostly exceeds both,
 /// unless masks resemble one another too much.
@@ -634,7 +634,7 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
     // Without a correct fit the other figures are meaningless, so the checks end at the first of these.
     let wrong = copy_of_a_mask(figures)
         .or_else(|| inverted_masks(figures))
-        .or_else(|| moved_parts_of_masks(figures))
+        .or_else(|| partly_moved_masks(figures))
         .or_else(|| resampled_masks(figures))
         .or_else(|| shifted_masks(figures));
     let wrong = wrong.filter(|_| !figures.is_uncertain);
@@ -759,7 +759,7 @@ fn shifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
 }
 
 /// Masks that fit a part of the picture only when they are shifted.
-fn moved_parts_of_masks(figures: &MeasurementFigures) -> Option<Finding> {
+fn partly_moved_masks(figures: &MeasurementFigures) -> Option<Finding> {
     let MovedParts { shift: [rows, columns], share, place: [row, column] } = figures.moved_parts?;
     if figures.explained < MIN_EXPLAINED {
         return None;
@@ -770,7 +770,7 @@ fn moved_parts_of_masks(figures: &MeasurementFigures) -> Option<Finding> {
          from parts, or the sensor is read in parts that don't fit together",
         100.0 * share
     );
-    Some(Finding::new(FindingCode::ShiftedMasks, detail))
+    Some(Finding::new(FindingCode::PartlyMovedMasks, detail))
 }
 
 /// Amplitude of the differences between the colours of a mosaic, if the measurement looks like one.
@@ -1318,7 +1318,7 @@ mod tests {
                 assert!(codes(&window, &y).is_empty(), "{seed}: {:?}", codes(&window, &y));
                 let whole = measure(masks.view(), scene.view()).unwrap();
                 y.slice_mut(s![70.., ..]).assign(&whole.slice(s![70.., 1..]));
-                assert_eq!(codes(&window, &y), ["shifted_masks"], "{seed}");
+                assert_eq!(codes(&window, &y), ["partly_moved_masks"], "{seed}");
             }
         }
     }
