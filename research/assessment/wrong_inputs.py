@@ -71,7 +71,8 @@ def filmed(clips, index, count, side):
 class Scene:
     """A scene, its masks and its snapshot. `variant` is ''; 'steady' or 'static' for independent masks and a motion of 1.5
     or 0 pixels per frame; 'squares' for random squares and a motion of 1.5; 'grey' for masks with values between 0 and 1;
-    'filmed' for a clip behind independent masks, and no camera motion."""
+    'balanced' for independent masks, each followed by its inverse, and a motion of 1.5; 'filmed' for a clip behind
+    independent masks, and no camera motion."""
 
     def __init__(self, binary, files, clips, index, variant, side):
         self.name, self.index, self.rng = f'{index}{variant}', index, np.random.default_rng([3, index])
@@ -99,6 +100,10 @@ class Scene:
             self.clean, self.truth = np.load(folder / 'one/measurement.npy').reshape(side, side), np.load(folder / 'one/truth.npy')
         moved = panned(photo, ratio, side, 10, scale)
         self.noise = self.clean - self.light(self.truth)
+        if variant == 'balanced':
+            for masks in self.masks, self.other:
+                masks[1::2] = 1 - masks[::2]
+            self.clean = self.light(self.truth) + self.noise
         self.fast, self.fast_truth = self.light(moved) + self.noise, moved
         self.dark = np.float32(DARK * self.clean.mean()) * (1 + .1 * rng.standard_normal(self.clean.shape, np.float32))
 
@@ -217,6 +222,23 @@ def unmasked(y, light, rng):
     return light * (1 + .01 * rng.standard_normal(y.shape))
 
 
+def nearly_black(scene):
+    """One value in 40 rows and columns, a little above the dark."""
+    level = scene.clean.mean() * (DARK + np.random.default_rng([9, scene.index]).uniform(.05, .09))
+    return area(lambda y, light, rng: np.full_like(y, level))(scene)
+
+
+def stray_light(peak):
+    """A smooth spot of light that did not pass the masks. `peak` is relative to the mean of the measurement."""
+    def make(scene):
+        rng, side = np.random.default_rng([10, scene.index]), len(scene.clean)
+        (row, column), width = rng.uniform(.2, .8, 2) * side, rng.uniform(.06, .2) * side
+        rows, columns = np.mgrid[:side, :side]
+        spot = np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / (2 * width ** 2))
+        return taken(scene, y=scene.clean + scene.dark + peak * scene.clean.mean() * spot)
+    return make
+
+
 def moved(masks, rows, columns):
     """Masks that are displaced by a fraction of a pixel."""
     matrix = np.float32([[1, 0, columns], [0, 1, rows]])
@@ -233,6 +255,13 @@ def exchanged(scene):
 
 def shuffled(scene):
     return scene.masks[np.random.default_rng([6, scene.index]).permutation(len(scene.masks))]
+
+
+def moved_in_half(scene):
+    """Masks that moved by a pixel in the lower half."""
+    masks, half = scene.masks.copy(), scene.masks.shape[1] // 2
+    masks[:, half:] = np.roll(masks, 1, axis=2)[:, half:]
+    return masks
 
 
 def zoomed(masks, factor):
@@ -326,6 +355,7 @@ KINDS = [
     Kind('right: steady motion, random squares', (), right, RIGHT, 'squares'),
     Kind('right: grey masks', (), right, RIGHT, 'grey'),
     Kind('right: static scene', (), right, RIGHT, 'static'),
+    Kind('right: masks with a constant sum', ('unfamiliar_masks',), right, RIGHT, 'balanced'),
     Kind('right: noise of sigma 50', (), noisy, RIGHT),
     Kind('right: clips', ('fast_motion',), right, RIGHT, 'filmed'),
 
@@ -358,10 +388,16 @@ KINDS = [
     Kind('clusters of 3x3 hot pixels', ('bad_pixels', 'saturated'), with_pixels(cluster(1))),
     Kind('a part of the sensor with noise alone', ('unmodulated_area',), area(frozen)),
     Kind('a part of the picture without masks', ('unmodulated_area',), area(unmasked)),
+    Kind('a part of the sensor with one value near black', ('unmodulated_area', 'bad_pixels'), nearly_black),
+    Kind('stray light with a peak of 3 times the mean', ('unmodulated_area',), stray_light(3)),
+    Kind('stray light with a peak of 1.5 times the mean', ('unmodulated_area',), stray_light(1.5)),
+    Kind('stray light with a peak of the mean', ('unmodulated_area',), stray_light(1)),
+    Kind('stray light with a peak of 0.7 times the mean', ('unmodulated_area',), stray_light(.7)),
     Kind('a snapshot of 0', ('refused: 0',), lambda s: taken(s, y=s.dark)),
     Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
 
     Kind('masks of another calibration', ('foreign_masks',), with_masks(lambda s: s.other), masks=True),
+    Kind('masks of another calibration, masks with a constant sum', ('foreign_masks',), with_masks(lambda s: s.other), HIDDEN, 'balanced', masks=True),
     Kind('inverted masks (1 - C)', ('inverted_masks',), with_masks(lambda s: 1 - s.masks), masks=True),
     Kind('masks flipped from left to right', ('turned_masks',), with_masks(lambda s: s.masks[:, :, ::-1]), masks=True),
     Kind('masks flipped upside down', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1]), masks=True),
@@ -373,6 +409,7 @@ KINDS = [
     Kind('masks shifted by 2 pixels', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, 2, axis=2)), masks=True),
     Kind('masks shifted by 3 rows and 4 columns', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, (3, -4), axis=(1, 2))), masks=True),
     Kind('crop that begins 8 rows and 20 columns away', ('shifted_masks',), with_masks(lambda s: np.roll(s.masks, (-8, 20), axis=(1, 2))), masks=True),
+    Kind('masks shifted by 1 pixel in one half', ('partly_moved_masks',), with_masks(moved_in_half), masks=True),
     Kind('drift by half a pixel', ('drifted_masks',), with_masks(lambda s: moved(s.masks, 0, .5)), masks=True),
     Kind('drift by 0.35 rows and 0.35 columns', ('drifted_masks',), with_masks(lambda s: moved(s.masks, .35, .35)), masks=True),
     Kind('masks resampled by 1 %', ('resampled_masks',), with_masks(lambda s: zoomed(s.masks, 1.01)), masks=True),
@@ -388,7 +425,8 @@ KINDS = [
     Kind('the last mask missing, masks that resemble one another', ('missing_mask',), without_mask('last'), HIDDEN, 'grey', masks=True),
     Kind('one mask twice', ('bad_calibration: repeated_pattern',), with_masks(one_mask(None)), masks=True),
     Kind('one mask black', ('refused: open pixels',), with_masks(one_mask(0)), masks=True),
-    Kind('a pattern that was not shown', ('missing_pattern',), without_a_pattern),
+    Kind('a pattern that was not shown, independent masks', ('missing_pattern',), without_a_pattern, variant='steady'),
+    Kind('a pattern that was not shown, masks that resemble one another', ('missing_pattern',), without_a_pattern, HIDDEN, 'grey'),
     Kind('two masks exchanged, steady motion, independent masks', ('exchanged_masks',), with_masks(exchanged), variant='steady', masks=True, harmful=SEEN),
     Kind('masks shuffled, steady motion, independent masks', ('exchanged_masks',), with_masks(shuffled), variant='steady', masks=True, harmful=SEEN),
     Kind('two masks exchanged, steady motion, random squares', ('exchanged_masks',), with_masks(exchanged), HIDDEN, 'squares', masks=True),
@@ -405,7 +443,7 @@ KINDS = [
 
 # The right input of each variant of the scenes.
 REFERENCE = {'': KINDS[0].name, 'steady': 'right: steady motion', 'squares': 'right: steady motion, random squares', 'grey': 'right: grey masks',
-             'static': 'right: static scene', 'filmed': 'right: clips'}
+             'static': 'right: static scene', 'balanced': 'right: masks with a constant sum', 'filmed': 'right: clips'}
 
 
 # ---------------------------------------------------------------- runs

@@ -262,6 +262,35 @@ fn a_drift_by_a_fraction_of_a_pixel_is_no_missing_dark() {
     assert!(["doubtful", "bad"].contains(&assessment["grade"].as_str().unwrap()), "{assessment}");
 }
 
+#[test]
+fn stray_light_and_parts_with_one_value_are_doubtful() {
+    let (masks, y) = scene();
+    let mean = y.iter().sum::<f32>() / PIXELS as f32;
+    let spot = |at: usize| {
+        let distance = (at as f32 / SIDE as f32 - 70.0).hypot((at % SIDE) as f32 - 60.0);
+        1.5 * mean * (-0.5 * (distance / 16.0).powi(2)).exp()
+    };
+    let stray = y.iter().enumerate().map(|(at, y)| y + spot(at)).collect();
+    let is_stuck = |at: usize| (40..80).contains(&(at / SIDE)) && (40..80).contains(&(at % SIDE));
+    let stuck = |(at, y): (usize, &f32)| if is_stuck(at) { 0.07 * mean } else { *y };
+    for y in [stray, y.iter().enumerate().map(stuck).collect::<Vec<f32>>()] {
+        let (assessment, codes) = reconstruct(&masks, &y);
+        assert_eq!(codes[0], "unmodulated_area", "{codes:?}");
+        assert_eq!(assessment["psnr_db"], Value::Null);
+        assert!(["doubtful", "bad"].contains(&assessment["grade"].as_str().unwrap()));
+    }
+}
+
+#[test]
+fn masks_that_moved_in_one_half_are_named() {
+    let (masks, y) = scene();
+    let source = |at: usize| if at % PIXELS < PIXELS / 2 { at } else { at - 1 };
+    let moved: Vec<f32> = (0..masks.len()).map(|at| masks[source(at)]).collect();
+    let (assessment, codes) = reconstruct(&moved, &y);
+    assert_eq!(codes[0], "partly_moved_masks", "{codes:?}");
+    assert_eq!(assessment["psnr_db"], Value::Null);
+}
+
 /// Square masks in the order of axes that `h5write` of MATLAB leaves, which the sizes can't show.
 #[tokio::test]
 async fn the_axes_of_square_masks_are_named() {
@@ -454,6 +483,10 @@ async fn a_missing_mask_is_named_before_the_dark() {
         assert_eq!(codes[0], "missing_mask", "{missing}: {codes:?}");
         assert_eq!(assessment["psnr_db"], Value::Null);
     }
+    // One of few masks takes a large share of the light with it.
+    let few = &masks[..6 * PIXELS];
+    let (_, codes) = reconstruct(&few[PIXELS..], &snapshot(few));
+    assert_eq!(codes[0], "missing_mask", "{codes:?}");
     // The service has the same warning.
     let app = TestApp::with(&["--workers", "1"]).await;
     let (mut masks, y) = scene();

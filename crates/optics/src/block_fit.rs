@@ -2,8 +2,8 @@
 //!
 //! In a block of 16x16 pixels the scene is nearly uniform apart from a slope, and its light changes smoothly from band to
 //! band: `x_k = sum_j a_j phi_j(k)` with a few hat functions `phi_j`. Least squares fits `y = plane + sum_j a_j D_j` with
-//! `D_j = sum_k phi_j(k) C_k`. The right masks explain more of what the plane leaves than the masks of the four blocks
-//! around do. A uniform spectrum tells how much more to expect, whatever the noise and the texture of the scene.
+//! `D_j = sum_k phi_j(k) C_k`. The right masks explain more of the residual of the plane than the masks of the four blocks
+//! around do. The gain that a uniform spectrum would have is expected, whatever the noise and the texture of the scene.
 
 use ndarray::{Array1, Array2, ArrayView2, ArrayView3, Axis, s};
 
@@ -49,14 +49,14 @@ struct Block {
     expected: f64,
 }
 
-/// How well masks fit the blocks of a measurement.
+/// The fit of masks to the blocks of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BlockFit {
     /// Mean share of the energy that the masks explain beyond those of other blocks, relative to the rest of these.
     pub gain: f64,
     /// Standard error of `gain`.
     pub error: f64,
-    /// The gain of the right masks if the scene has the same light in all bands.
+    /// The gain of the right masks if all bands have the same light.
     pub expected: f64,
     /// The shift (rows, columns) of the masks, in pixels, with the largest gain.
     pub shift: (i32, i32),
@@ -78,7 +78,7 @@ struct Window<'a> {
     sum: Array2<f32>,
 }
 
-/// The measured pixels of a block beside the plane.
+/// The measured pixels of a block, and the plane in them.
 struct Pixels {
     row: usize,
     column: usize,
@@ -258,8 +258,10 @@ impl BlockStudy {
 /// Reports masks that do not belong to a measurement, or fit after a shift.
 pub fn judge_blocks(fit: &BlockFit) -> Option<Finding> {
     let percent = |share: f64| 100.0 * share.max(0.0);
+    let is_refuted = fit.gain + SURE * fit.error < MIN_GAIN * fit.expected;
+    let least = if is_refuted { SURE } else { SHIFT_SIGNIFICANCE };
     let is_shifted = fit.shift != (0, 0)
-        && fit.significance > SHIFT_SIGNIFICANCE
+        && fit.significance > least
         && fit.shifted_gain > MIN_IMPROVEMENT * fit.gain
         && fit.shifted_gain > MIN_SHIFTED_GAIN * fit.expected;
     if is_shifted {
@@ -272,7 +274,6 @@ pub fn judge_blocks(fit: &BlockFit) -> Option<Finding> {
         );
         return Some(Finding::new(FindingCode::ShiftedMasks, detail));
     }
-    let is_refuted = fit.gain + SURE * fit.error < MIN_GAIN * fit.expected;
     is_refuted.then(|| {
         let detail = format!(
             "block by block, the masks explain {:.1} % more of the measurement than masks of other places, where about \

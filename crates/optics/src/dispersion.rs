@@ -281,8 +281,9 @@ impl Dispersion {
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
             DeadPixels, DriftedMasks, ExchangedMasks, FastMotion, ForeignMasks, MaskValues,
-            MissingMask, MissingPattern, NegativeOffset, NoDark, OneDimensional, RepeatedPattern,
-            ResampledMasks, StuckPixels, SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
+            MissingMask, MissingPattern, NegativeOffset, NoDark, OneDimensional, PartlyMovedMasks,
+            RepeatedPattern, ResampledMasks, StuckPixels, SwappedOrder, UnevenPatterns,
+            UnmodulatedArea, WrongDark,
         };
         !matches!(
             code,
@@ -297,6 +298,7 @@ impl Dispersion {
                 | NegativeOffset
                 | NoDark
                 | OneDimensional
+                | PartlyMovedMasks
                 | RepeatedPattern
                 | ResampledMasks
                 | StuckPixels

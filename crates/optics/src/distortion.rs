@@ -1,6 +1,7 @@
 //! Magnification and rotation of masks against a measurement, from the displacements of its parts.
 //!
-//! Masks that were resampled, and optics that were refocused, displace each part of the picture by another amount.
+//! Masks that were resampled, and optics that were refocused, displace each part of the picture by another amount. A sensor
+//! that is read in halves, and pictures that were stitched, displace some parts by the same whole pixels.
 
 use ndarray::Array2;
 
@@ -11,6 +12,8 @@ pub(super) struct Part {
     pub(super) place: [f64; 2],
     /// Share of its fine structure that the masks explain at each displacement, by rows and columns.
     pub(super) explained: Array2<f64>,
+    /// `sum y' S'` at each displacement, where S is the sum of the masks.
+    pub(super) products: Array2<f64>,
 }
 
 /// The change after which the masks fit all parts of the picture.
@@ -141,4 +144,53 @@ pub(super) fn distortion(parts: &[Part]) -> Option<Distortion> {
         rotation: model.rotation,
         largest,
     })
+}
+
+/// Parts of the picture that the masks fit at another place than the rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MovedParts {
+    /// The displacement (rows, columns) of the masks that fits them, in pixels.
+    pub shift: [i32; 2],
+    /// Their share of the parts with enough structure.
+    pub share: f64,
+    /// Row and column of the middle of the one that gains most.
+    pub place: [f64; 2],
+}
+
+/// Smallest number of moved parts, and of those at their place.
+const MIN_MOVED: usize = 2;
+/// Share of the parts that must be in one of these groups.
+const MIN_GROUPED: f64 = 0.8;
+/// Smallest gain of the product by the displacement, relative to the product after it. Of 190 scenes of 128x128 pixels, right
+/// masks have no gain. Masks that moved by one pixel in one half gain 0.2 to 1.
+const MIN_GAIN: f64 = 0.15;
+/// Parts with a smaller product than this share of the mean have no structure.
+const MIN_PRODUCT: f64 = 0.2;
+
+/// Parts that the masks fit after the same displacement, if the others fit without one.
+///
+/// The products with the sum of the masks decide: single masks that resemble one another fit elsewhere, too.
+pub(super) fn moved_parts(parts: &[Part]) -> Option<MovedParts> {
+    let peaks: Vec<_> = parts
+        .iter()
+        .filter_map(|part| {
+            let (rows, columns) = part.products.dim();
+            let (at, peak) = part.products.indexed_iter().max_by(|a, b| a.1.total_cmp(b.1))?;
+            let shift = [(rows / 2) as i32 - at.0 as i32, (columns / 2) as i32 - at.1 as i32];
+            let gain = (peak - part.products[[rows / 2, columns / 2]]) / peak;
+            Some((part.place, shift, *peak, gain))
+        })
+        .collect();
+    let mean = peaks.iter().map(|(_, _, peak, _)| peak).sum::<f64>() / peaks.len() as f64;
+    let with_structure = || peaks.iter().filter(|(_, _, peak, _)| *peak > MIN_PRODUCT * mean);
+    let at = |place: [i32; 2]| with_structure().filter(move |(_, shift, ..)| *shift == place);
+    let moved = || with_structure().filter(|(.., gain)| *gain > MIN_GAIN);
+    let gaining = |place: [i32; 2]| moved().filter(|(_, shift, ..)| *shift == place).count();
+    let shift = moved().map(|(_, shift, ..)| *shift).max_by_key(|shift| gaining(*shift))?;
+    let [resting, displaced] = [[0, 0], shift].map(|place| at(place).count());
+    let count = with_structure().count() as f64;
+    let (place, ..) = at(shift).max_by(|a, b| a.3.total_cmp(&b.3))?;
+    let convincing = resting.min(gaining(shift)) >= MIN_MOVED
+        && (resting + displaced) as f64 >= MIN_GROUPED * count;
+    convincing.then_some(MovedParts { shift, share: displaced as f64 / count, place: *place })
 }

@@ -187,6 +187,10 @@ findings! {
         "the masks fit better when shifted (by up to 32 pixels)",
         "check that masks and measurement have the same `crop`; if they have, the optics moved since the \
          calibration: calibrate again (a job with `registration` auto corrects up to 4 pixels)";
+    PartlyMovedMasks: [Measurement], [Error],
+        "the masks are displaced in a part of the picture",
+        "check that the sensor is read in the same way as during the calibration, and that neither masks nor measurement \
+         were put together from parts; then calibrate again";
     DriftedMasks: [Measurement], [Warning],
         "the masks are displaced by a fraction of a pixel",
         "calibrate again once the optics are stable (a job with `registration` auto corrects the drift); if the \
@@ -214,8 +218,8 @@ findings! {
         "send one mask for each frame of the exposure, in the order in which the patterns are shown; if none is missing, \
          record the dark frames again";
     UnmodulatedArea: [Measurement], [Warning],
-        "the masks hardly modulate the light of a part of the picture",
-        "look there for glare, a reflection, or a part of the sensor that repeats old values; if it can't be removed, \
+        "the masks modulate the light of a part of the picture too weakly",
+        "look there for glare, a reflection, stray light, or a part of the sensor that repeats old values; if it can't be removed, \
          mark the part in the map of `bad_pixels` of the calibration";
     ForeignMasks: [Measurement], [Error],
         "the masks do not explain the measurement",
@@ -278,6 +282,7 @@ impl FindingCode {
             | Self::Negative
             | Self::NegativeOffset
             | Self::NoDark
+            | Self::PartlyMovedMasks
             | Self::ResampledMasks
             | Self::ShiftedMasks
             | Self::TurnedMasks

@@ -40,7 +40,7 @@ pub use camera::{Camera, illumination};
 pub use defects::{Defects, judge_defects, judge_light};
 pub use dispersion::{Dispersion, DispersionAxis, DispersionError, MAX_BANDS, MaskExtent};
 pub use displacement::{Displacement, Magnified, central, displacement, magnification, magnified};
-pub use distortion::Distortion;
+pub use distortion::{Distortion, MovedParts};
 pub use finding::{Doubt, Entry, Finding, FindingCode, Severity, Subject};
 pub use geometry::Geometry;
 pub use iid::iid_masks;

@@ -149,7 +149,7 @@ fn slope(strips: &[Strip], fit: &Fit, weights: &[Array1<f64>]) -> f64 {
     if across > 0.0 { 0.5 * with_y / across } else { 0.0 }
 }
 
-/// Residual of the plainest tenth of the blocks, relative to the energy of one mask there, and the energy of all masks
+/// Residual of the plainest tenth of the blocks, relative to the energy of one missing mask there, and the energy of all masks
 /// relative to that of their sum.
 fn plainest_blocks(strips: &[Strip], fit: &Fit) -> (f64, f64) {
     let (mut mask_energy, mut sum_energy, mut pixels) = (0.0, 0.0, 0.0);
@@ -163,7 +163,8 @@ fn plainest_blocks(strips: &[Strip], fit: &Fit) -> (f64, f64) {
         sum_energy += energy(predicted.view());
         pixels += strip.measured.sum() * (BLOCK * BLOCK) as f64;
     }
-    let energy_per_mask = mask_energy / pixels / fit.brightness.len().max(1) as f64;
+    let masks = fit.brightness.len().max(1) as f64;
+    let energy_per_mask = mask_energy / pixels / masks;
     let mut residuals = Vec::new();
     for strip in strips {
         let squares = strip.squared_residuals(&fit.brightness);
@@ -172,7 +173,8 @@ fn plainest_blocks(strips: &[Strip], fit: &Fit) -> (f64, f64) {
                 continue;
             }
             let light = strip.mask_means.column(block).dot(&fit.brightness);
-            let factor = (strip.y_means[block] / light).max(0.1);
+            // The light includes that of one more mask.
+            let factor = (strip.y_means[block] / light * masks / (masks + 1.0)).max(0.1);
             residuals.push(square / (energy_per_mask * factor * factor).max(f64::MIN_POSITIVE));
         }
     }

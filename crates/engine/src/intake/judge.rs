@@ -27,8 +27,8 @@ const SNAPSHOTS: usize = 8;
 pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding> {
     use FindingCode::{
         BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, InvertedMasks, Level, MaskScale,
-        MaskValues, MissingMask, NegativeOffset, NoDark, ResampledMasks, Saturated, ShiftedMasks,
-        TurnedMasks, WrongDark,
+        MaskValues, MissingMask, NegativeOffset, NoDark, PartlyMovedMasks, ResampledMasks,
+        Saturated, ShiftedMasks, TurnedMasks, WrongDark,
     };
     let is_one_of =
         |finding: &Finding, codes: &[FindingCode]| codes.iter().any(|code| finding.is(*code));
@@ -39,6 +39,7 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
     let wrong_masks = [
         BinaryMeasurement,
         InvertedMasks,
+        PartlyMovedMasks,
         ResampledMasks,
         ShiftedMasks,
         TurnedMasks,
@@ -94,7 +95,7 @@ pub fn judge(
         let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
         let Some(mut figures) = studied.finish() else { continue };
         if dispersion.is_some() {
-            (figures.distortion, figures.alteration) = (None, None);
+            (figures.distortion, figures.moved_parts, figures.alteration) = (None, None, None);
         }
         if let Some(part) = figures.unmodulated.as_mut().filter(|_| mosaic.is_some()) {
             part.place = part.place.map(|at| 2 * at);
