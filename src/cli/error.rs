@@ -95,7 +95,7 @@ impl From<ReconError> for CliError {
 impl From<ServeError> for CliError {
     fn from(error: ServeError) -> Self {
         match error {
-            ServeError::Config(error) => Self::Input(error.to_string()),
+            ServeError::Exposed(_) => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }
     }
