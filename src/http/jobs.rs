@@ -526,8 +526,7 @@ pub(super) async fn change(
     if let Some(error) = invalid {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     if let Some(Some(sha256)) = truth {
         let shape = app.store.job(&access.lab, id).await?.spec.frame_shape();
         truth::check(&app, &access.lab, sha256, shape).await?;
@@ -560,8 +559,7 @@ pub(super) async fn cancel(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<Response> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.cancel_job(&access.lab, id).await?;
     let body = body(&app, &access.lab, id).await?;
     // A running tile stops after the iteration that it is in.
@@ -575,8 +573,7 @@ pub(super) async fn retry(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<Response> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.retry_job(&access.lab, id).await?;
     let body = body(&app, &access.lab, id).await?;
     accepted(&body, body.progress.eta_seconds)
@@ -596,8 +593,7 @@ pub(super) async fn delete(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

@@ -6,10 +6,10 @@ use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-use super::context::{RequestContext, changed};
+use super::context::changed;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, created, request_key};
-use super::submissions::{Shown, body, make};
+use super::extract::{Body, Caller, created, request_key};
+use super::submissions::{Shown, make};
 use engine::job::{Label, ModelId, ModelRequest, Submission, Timestamp};
 use store::{Asked, NewModel, StoreError};
 
@@ -63,12 +63,4 @@ pub(super) async fn create(
         return Err(ApiError::new(Code::TimedOut, detail));
     }
     Ok((location, changed(status, &ModelId::body(asked)?)?).into_response())
-}
-
-pub(super) async fn show(
-    Caller(app, access): Caller,
-    Params(id): Params<ModelId>,
-    request: RequestContext,
-) -> Result<Response> {
-    request.json(&body(&app, &access.lab, id).await?)
 }

@@ -52,7 +52,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/measurements").get(submissions::list::<MeasurementId>).query().post(submissions::create::<MeasurementId>).slow(),
         R::at("/v1/measurements/{measurement}").get(submissions::show::<MeasurementId>).patch(submissions::rename::<MeasurementId>).delete(submissions::delete::<MeasurementId>),
         R::at("/v1/models").get(submissions::list::<ModelId>).query().post(models::create).slow(),
-        R::at("/v1/models/{model}").get(models::show).patch(submissions::rename::<ModelId>).delete(submissions::delete::<ModelId>),
+        R::at("/v1/models/{model}").get(submissions::show::<ModelId>).patch(submissions::rename::<ModelId>).delete(submissions::delete::<ModelId>),
         R::at("/v1/algorithms").get(algorithms::list),
         R::at("/v1/jobs").get(jobs::list).query().post(jobs::create).only(Rule::AcrossLabs),
         R::at("/v1/samples").post(samples::create),

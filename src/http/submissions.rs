@@ -109,8 +109,7 @@ pub(super) async fn rename<Id: Shown>(
     request: RequestContext,
     Body(renaming): Body<Renaming>,
 ) -> Result<Response> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.rename(&access.lab, id, renaming.name.as_ref()).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
@@ -120,8 +119,7 @@ pub(super) async fn delete<Id: Shown>(
     Params(id): Params<Id>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.delete(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

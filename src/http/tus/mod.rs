@@ -234,7 +234,7 @@ pub(super) async fn patch(
     request: RequestContext,
     body: Body,
 ) -> Result<Response> {
-    drop(request.precondition(&app.changes, &access.lab, current(&app, &access.lab, id)).await?);
+    drop(app.precondition(&request, &access.lab, current(&app, &access.lab, id)).await?);
     let permit = app.admission.place(&access.lab)?;
     let upload = run_detached(async move {
         let _permit = permit;
@@ -340,8 +340,7 @@ pub(super) async fn delete(
     Params(id): Params<PartialId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, current(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, current(&app, &access.lab, id)).await?;
     app.store.partial(&access.lab, id).await?;
     let store = app.store.clone();
     let deleted = run_detached(async move { Ok(store.delete_partial(id).await?) });
