@@ -53,5 +53,7 @@ pub use task::{
     MIN_MOVIE_SIDE, MOVIE_SIDE, MovieFormat, ResultFile, TaskKind, TaskProgress, TaskStage,
     TaskState, WrittenFile, movie_step,
 };
-pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, with_causes, without_paths};
+pub use text::{
+    HashingWriter, InvalidField, InvalidText, Label, Sha256, Timestamp, with_causes, without_paths,
+};
 pub use webhook::Webhook;
