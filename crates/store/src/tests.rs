@@ -34,6 +34,17 @@ use engine::job::{
 
 const LEASE: Duration = Duration::from_secs(60);
 
+impl Store {
+    /// Hands out the next task to a worker of this machine that takes all kinds.
+    async fn claim(
+        &self,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>, StoreError> {
+        self.claim_as(Claimant::Local, worker, length).await
+    }
+}
+
 impl ClaimedTask {
     /// The step of a job.
     fn step(&self) -> &JobTask {
@@ -108,7 +119,12 @@ impl Lab {
             sequence: Sequence::Separate,
             dark: Vec::new(),
             warnings: Vec::new(),
-            reading: Reading::whole(ScaleBasis::Type),
+            reading: Reading {
+                scale_basis: ScaleBasis::Type,
+                crop: None,
+                frames: None,
+                packing: None,
+            },
         };
         let asked = MeasurementRequest::new(None, calibration, data.sha256);
         let passed = Checked::Measurement(Box::new(facts), upload(b"prepared data"));

@@ -244,11 +244,6 @@ impl Claimant<'_> {
 }
 
 impl Store {
-    /// Hands out the next task of any kind, if there is one.
-    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
-        self.claim_as(Claimant::Local, worker, length).await
-    }
-
     /// Hands out the next task that this claimant may have, if there is one.
     pub async fn claim_as(
         &self,
@@ -363,10 +358,7 @@ impl Store {
     ) -> Result<Work> {
         let job = self.job_of_any_lab(job).await?;
         let measurement = self.thing_of_any_lab(job.spec.measurement).await?;
-        let white: Option<Json<Value>> =
-            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job.id])
-                .fetch_one(&self.readers)
-                .await?;
+        let white = self.white_record(job.id).await?;
         let window = self.movie_window(job.id, format.task(snapshot)).await?;
         let mut clips = Vec::new();
         for snapshot in
@@ -375,7 +367,6 @@ impl Store {
             let (stack, path) = self.result_file(&job, Some(snapshot), STACK).await?;
             clips.push((path, stack.file.sha256));
         }
-        let white = white.map(|json| json.0);
         let (job, spec) = (job.id, job.spec);
         let work = MovieWork { job, spec, format, measurement, white, window, clips };
         Ok(Work::Movie(Box::new(work)))
