@@ -1,6 +1,6 @@
 //! Conditional and partial requests (RFC 9110): `If-Match`, `If-None-Match`, `If-Range` and `Range`.
 
-use axum::http::{HeaderMap, HeaderName, Method, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ETag, HeaderMapExt, IfMatch, IfNoneMatch};
 use serde::Serialize;
@@ -62,6 +62,17 @@ pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -
         Ok(None) => (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response(),
         Err(error) => error.into_response(),
     }
+}
+
+/// Answers with a page that loads the style sheet and pictures of the service, and no scripts.
+pub(super) fn page(headers: &HeaderMap, text: String) -> Response {
+    const POLICY: HeaderValue = HeaderValue::from_static(
+        "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; form-action 'none'; \
+         frame-ancestors 'none'",
+    );
+    let mut response = content(headers, "text/html; charset=utf-8", text.into_bytes());
+    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, POLICY);
+    response
 }
 
 /// Answers with a JSON body and its ETag, or with 304 if the client has it.
