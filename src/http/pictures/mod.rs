@@ -11,7 +11,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use names::Named;
-pub(super) use names::{OfBlob, OfCalibration, OfJob, OfMeasurement};
+pub(super) use names::{Of, OfJob};
 
 use super::app::App;
 use super::conditional;
