@@ -203,7 +203,7 @@ fn announce(root: &Path, address: SocketAddr, settings: &ServeArguments) -> Resu
     writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(io("print the address"))
 }
 
-/// Limit of a worker's address space in bytes, for the largest planned resident memory.
+/// Limit of a worker's data (`RLIMIT_DATA`) in bytes, for the largest planned resident memory.
 fn allowance(planned: u64) -> u64 {
     planned.saturating_add(planned / 4).saturating_add(256 << 20)
 }

@@ -42,8 +42,8 @@ struct Create {
     /// The lab that the token gives access to. Data that were created without a token belong to `local`.
     #[arg(long, value_name = "NAME")]
     lab: Lab,
-    /// read: view and download; submit: also upload, request jobs, cancel and delete; admin: also view the metrics of
-    /// the whole service.
+    /// read: view and download; submit: also upload, request jobs, cancel and delete; admin: also view /metrics and
+    /// /v1/system, and give jobs a priority above 0.
     #[arg(long, value_name = "ROLE", default_value = "submit")]
     role: Role,
     /// Give access to all labs; with the role admin, also to their limits.

@@ -56,7 +56,8 @@ pub(super) struct JobBody {
     priority: i32,
     /// The upload with the true frames; null if they are unknown.
     truth: Option<Sha256>,
-    /// Findings of the check of the measurement, `bad_calibration`, `moved_masks` and `misplaced_masks`.
+    /// Findings of the check of the measurement, `bad_calibration`, `moved_masks` and `misplaced_masks`; while no worker takes
+    /// tiles, `no_tile_workers`.
     warnings: Vec<Finding>,
     /// The failure in words.
     error: Option<String>,
