@@ -24,8 +24,8 @@ use engine::job::{
     TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
-    Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
-    NewJob, Page, RequestKey, Span, StoreError,
+    Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob,
+    Page, RequestKey, ResourceKind, Span, StoreError,
 };
 
 /// A job with its progress.
@@ -306,10 +306,11 @@ pub(super) async fn make(
     request: JobRequest,
     key: Option<RequestKey>,
 ) -> Result<(StatusCode, JobBody)> {
-    let inserted = match app.store.made_with(&access.lab, Made::Job, key.as_ref()).await? {
-        Some(id) => Inserted::Before(id),
-        None => insert(app, access, request, key).await?,
-    };
+    let inserted =
+        match app.store.created_with(&access.lab, ResourceKind::Job, key.as_ref()).await? {
+            Some(id) => Inserted::Before(id),
+            None => insert(app, access, request, key).await?,
+        };
     let (status, id) = created(inserted);
     Ok((status, body(app, &access.lab, id).await?))
 }

@@ -27,9 +27,8 @@ use super::{
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
-    MeasurementId, MeasurementRequest, Reading, ResultFile, ScaleBasis, Sequence, Sha256,
-    SnapshotSelection, Submission, TaskKind, TaskProgress, ThingId, TileSpec, WorkerId,
-    WrittenFile,
+    MeasurementId, MeasurementRequest, Reading, ResourceId, ResultFile, ScaleBasis, Sequence,
+    Sha256, SnapshotSelection, Submission, TaskKind, TaskProgress, TileSpec, WorkerId, WrittenFile,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
@@ -137,7 +136,7 @@ impl Lab {
     /// Makes something of uploads, whose check ends like this.
     async fn make<Id>(&self, asked: Submission, passed: Checked) -> Id
     where
-        Id: From<ThingId> + FromStr<Err = InvalidId>,
+        Id: From<ResourceId> + FromStr<Err = InvalidId>,
     {
         make(&self.store, self.worker, asked, passed).await
     }
@@ -307,7 +306,7 @@ fn new_request(submission: Submission) -> NewRequest {
 /// Requests something, and does its check with this outcome.
 async fn make<Id>(store: &Store, worker: WorkerId, asked: Submission, passed: Checked) -> Id
 where
-    Id: From<ThingId> + FromStr<Err = InvalidId>,
+    Id: From<ResourceId> + FromStr<Err = InvalidId>,
 {
     let local = engine::job::Lab::local();
     let is_model = matches!(asked, Submission::Model(_));

@@ -26,8 +26,8 @@ pub use algorithm::Algorithm;
 pub use assessment::{Assessment, MaskOrder};
 pub use captures::{Captures, MAX_CALIBRATION_SECONDS, MAX_MASKS, planned_seconds};
 pub use ids::{
-    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,
-    WorkerId,
+    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, ResourceId, TaskId,
+    TokenId, WorkerId,
 };
 pub use inputs::{CorrectedMasks, Inputs, MaskInputs, MeasurementInputs, fields};
 pub use model::{
