@@ -480,24 +480,11 @@ pub enum LogFormat {
     Json,
 }
 
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The service would be open to everyone.
-    #[error(
-        "{0} can be reached from other machines, and everyone could do everything: create a token \
-        (sci-recon token create), listen on 127.0.0.1, or set --allow-remote if the network is \
-        trusted"
-    )]
-    Remote(SocketAddr),
-}
-
 impl ServeArguments {
-    /// Checks combinations of settings; `open` means that there are no tokens.
-    pub fn check(&self, open: bool) -> Result<(), ConfigError> {
-        if open && !self.listen.ip().is_loopback() && !self.allow_remote {
-            return Err(ConfigError::Remote(self.listen));
-        }
-        Ok(())
+    /// True if other machines can reach the service and need no token; `open` means that there are no tokens.
+    #[must_use]
+    pub fn is_exposed(&self, open: bool) -> bool {
+        open && !self.listen.ip().is_loopback() && !self.allow_remote
     }
 
     #[must_use]
@@ -644,13 +631,12 @@ mod tests {
     fn a_public_address_needs_permission_or_tokens() {
         let serve = |listen: &[&str]| {
             let line = [&["serve", "--data", "d"], listen].concat();
-            Serve::try_parse_from(line).unwrap().arguments.check(true)
+            Serve::try_parse_from(line).unwrap().arguments.is_exposed(true)
         };
-        assert!(serve(&[]).is_ok());
-        assert!(serve(&["--listen", "[::1]:0"]).is_ok());
-        let error = serve(&["--listen", "0.0.0.0:80"]).unwrap_err().to_string();
-        assert!(error.contains("--allow-remote"), "{error}");
-        assert!(serve(&["--listen", "0.0.0.0:80", "--allow-remote"]).is_ok());
+        assert!(!serve(&[]));
+        assert!(!serve(&["--listen", "[::1]:0"]));
+        assert!(serve(&["--listen", "0.0.0.0:80"]));
+        assert!(!serve(&["--listen", "0.0.0.0:80", "--allow-remote"]));
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! Records the changes that commands make on the machine of the service.
 
-use std::path::Path;
+use std::path::PathBuf;
+
+use clap::Args;
 
 use super::CliError;
 use super::serve::Announcement;
@@ -21,20 +23,33 @@ pub(super) struct Change {
     pub object: String,
 }
 
-/// The audit log with the given file, or else with that of the service that runs on the data folder.
-/// Errors: the file can't be written.
-pub(super) fn audit_log(arguments: &AuditArguments, data: &Path) -> Result<AuditLog> {
-    let announced = || Announcement::read(data).ok()?.audit_log;
-    let Some(file) = arguments.audit_log.clone().or_else(announced) else {
-        return Ok(AuditLog::default());
-    };
-    AuditLog::open(Some(&file)).map_err(|error| {
-        let path = file.display();
-        CliError::Input(format!(
-            "the audit log {path} can't be written: {error}; nothing was changed. Run the command as the user of the \
-            service, or name another file with --audit-log"
-        ))
-    })
+/// The data folder that a command changes, and the log of its changes.
+#[derive(Debug, Args)]
+pub(super) struct FolderArguments {
+    /// Folder of the service's data; the service may be running.
+    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
+    pub data: PathBuf,
+    #[command(flatten)]
+    audit: AuditArguments,
+}
+
+impl FolderArguments {
+    /// The audit log with the given file, or else with that of the service that runs on the data folder.
+    ///
+    /// Errors: the file can't be written.
+    pub(super) fn log(&self) -> Result<AuditLog> {
+        let announced = || Announcement::read(&self.data).ok()?.audit_log;
+        let Some(file) = self.audit.audit_log.clone().or_else(announced) else {
+            return Ok(AuditLog::default());
+        };
+        AuditLog::open(Some(&file)).map_err(|error| {
+            let path = file.display();
+            CliError::Input(format!(
+                "the audit log {path} can't be written: {error}; nothing was changed. Run the command as the user of \
+                the service, or name another file with --audit-log"
+            ))
+        })
+    }
 }
 
 /// Makes a change, and records it with its outcome. On a full disk the reserve is given up first.

@@ -36,13 +36,8 @@ pub struct Arguments {
 /// The index of the captures. Fields of a measurement are ignored.
 #[derive(Debug, Deserialize)]
 struct Index {
-    masks: Vec<Vec<PathBuf>>,
-    white: Vec<PathBuf>,
-    black: Vec<PathBuf>,
-    #[serde(default)]
-    black_with_mask: Vec<PathBuf>,
-    patterns: Option<PathBuf>,
-    saturation: Option<u32>,
+    #[serde(flatten)]
+    captures: CaptureFiles,
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
@@ -96,21 +91,13 @@ fn write_report(arguments: &Arguments, report: &Report) -> Result<()> {
 fn read_index(path: &Path) -> Result<CaptureFiles> {
     let refused =
         |problem: &str| CliError::Input(format!("captures {}: {problem}", path.display()));
-    let index: Index = read_json("captures", path)?;
+    let Index { captures } = read_json("captures", path)?;
     let folder = path.parent().unwrap_or(Path::new("."));
-    let list = |files: Vec<PathBuf>| files.iter().map(|file| folder.join(file)).collect::<Vec<_>>();
-    if let Some(missing) = index.masks.iter().position(Vec::is_empty) {
+    if let Some(missing) = captures.masks.iter().position(Vec::is_empty) {
         return Err(refused(&format!("pattern {missing} (counted from 0) has no captures")));
     }
-    if index.masks.is_empty() || index.white.is_empty() || index.black.is_empty() {
+    if captures.masks.is_empty() || captures.white.is_empty() || captures.black.is_empty() {
         return Err(refused("masks, white and black each need captures"));
     }
-    Ok(CaptureFiles {
-        masks: index.masks.into_iter().map(list).collect(),
-        white: list(index.white),
-        black: list(index.black),
-        black_with_mask: list(index.black_with_mask),
-        patterns: index.patterns.map(|file| folder.join(file)),
-        saturation: index.saturation,
-    })
+    Ok(captures.map(|file| folder.join(file)))
 }

@@ -60,12 +60,17 @@ impl CliError {
     pub fn file(action: &str, path: &Path, error: &dyn Display) -> Self {
         Self::Failure(format!("cannot {action} {}: {error}", path.display()))
     }
+
+    /// The user named a file that can't be read.
+    pub fn unreadable(path: &Path, error: &dyn Display) -> Self {
+        Self::Input(format!("cannot read {}: {error}", path.display()))
+    }
 }
 
 /// Opens a file that the user names.
 pub fn open_input(path: &Path) -> Result<File> {
     formats::open_file(path).map_err(|error| match error {
-        FormatError::Io { source, .. } => CliError::file("read", path, &source),
+        FormatError::Io { source, .. } => CliError::unreadable(path, &source),
         other => CliError::Input(format!("{}: {other}", path.display())),
     })
 }
@@ -95,7 +100,7 @@ impl From<ReconError> for CliError {
 impl From<ServeError> for CliError {
     fn from(error: ServeError) -> Self {
         match error {
-            ServeError::Config(error) => Self::Input(error.to_string()),
+            ServeError::Exposed(_) => Self::Input(error.to_string()),
             other => Self::Failure(other.to_string()),
         }
     }

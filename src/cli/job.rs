@@ -1,16 +1,13 @@
 //! `sci-recon job`: manages the jobs of all labs, for the administrator of the machine.
 
-use std::path::PathBuf;
-
 use clap::{ArgGroup, Args, Subcommand};
 
 use super::CliError;
-use super::audited::{Change, audit_log, audited};
+use super::audited::{Change, FolderArguments, audited};
 use super::output::print_line;
 use super::wait::with_store;
 use crate::audit::AuditLog;
 use crate::cli::error::Result;
-use crate::config::AuditArguments;
 use engine::job::{JobId, JobState, Lab, Label, priority_error};
 use store::{Job, JobChanges, JobFilter, JobProgress, Store, StoreError};
 
@@ -22,11 +19,8 @@ const PAGE: u32 = 1000;
 /// The service may be running.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Folder of the service's data.
-    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
-    data: PathBuf,
     #[command(flatten)]
-    audit: AuditArguments,
+    folder: FolderArguments,
     #[command(subcommand)]
     action: Action,
 }
@@ -91,9 +85,9 @@ fn priority(text: &str) -> Result<i32, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let log = audit_log(&arguments.audit, &arguments.data)?;
+    let log = arguments.folder.log()?;
     let act = async |store: &Store| act(store, &log, &arguments.action).await;
-    print_line(with_store(&arguments.data, act)?)
+    print_line(with_store(&arguments.folder.data, act)?)
 }
 
 async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {

@@ -1,16 +1,13 @@
 //! `sci-recon lab`: manages labs, their shares of the machine, their quotas and their files.
 
-use std::path::PathBuf;
-
 use clap::{Args, Subcommand};
 
 use super::CliError;
-use super::audited::{Change, audit_log, audited};
+use super::audited::{Change, FolderArguments, audited};
 use super::output::print_line;
 use super::wait::with_store;
 use crate::audit::AuditLog;
 use crate::cli::error::Result;
-use crate::config::AuditArguments;
 use crate::webhooks::secret_text;
 use engine::job::{Lab, Sha256};
 use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
@@ -21,11 +18,8 @@ use store::{Blob, BlobRow, Entitlement, LabRow, Store, share_error};
 /// one with twice the share gets twice the processor time.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Folder of the service's data.
-    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
-    data: PathBuf,
     #[command(flatten)]
-    audit: AuditArguments,
+    folder: FolderArguments,
     #[command(subcommand)]
     action: Action,
 }
@@ -96,9 +90,9 @@ fn share(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(arguments: &Arguments) -> Result<()> {
-    let log = audit_log(&arguments.audit, &arguments.data)?;
+    let log = arguments.folder.log()?;
     let act = async |store: &Store| act(store, &log, &arguments.action).await;
-    print_line(with_store(&arguments.data, act)?)
+    print_line(with_store(&arguments.folder.data, act)?)
 }
 
 async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {

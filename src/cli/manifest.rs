@@ -12,10 +12,9 @@ use super::CliError;
 use super::client::Client;
 use super::error::{Result, open_input};
 use super::submission::{PlainArguments, create_calibration};
-use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256};
+use engine::job::{CalibrationId, MeasurementId, ModelId, ResultFile, Sha256};
+use engine::pipeline::manifest::JOB_SCHEMA;
 
-/// Schema of the manifest of a job.
-const SCHEMA: &str = "sci-recon/job/1";
 /// File with the frames of a snapshot.
 const FRAMES: &str = "frames.npy";
 /// Parts of the content that are not computed from the others.
@@ -68,22 +67,16 @@ struct Snapshot {
     files: Vec<ResultFile>,
 }
 
-#[derive(Debug, Deserialize)]
-struct ResultFile {
-    name: String,
-    sha256: Sha256,
-}
-
 impl Manifest {
     /// Errors: a file that can't be read, or is not the manifest of a job.
     pub(super) fn read(path: &Path) -> Result<Self> {
         let refused = |text: String| CliError::Input(format!("{}: {text}", path.display()));
-        let text = fs::read(path).map_err(|error| CliError::file("read", path, &error))?;
+        let text = fs::read(path).map_err(|error| CliError::unreadable(path, &error))?;
         let value: Value =
             serde_json::from_slice(&text).map_err(|error| refused(format!("no JSON: {error}")))?;
         let whole = "give the manifest.json of a job, which `sci-recon fetch` writes into the folder of the results";
         match value["schema"].as_str() {
-            Some(SCHEMA) => {}
+            Some(JOB_SCHEMA) => {}
             Some("sci-recon/snapshot/1") => {
                 let text = format!("this is the manifest of a snapshot: {whole}");
                 return Err(refused(text));
@@ -477,11 +470,11 @@ mod tests {
     fn manifest(frames: &[&str], size: u32) -> Value {
         let entry = |(snapshot, text): (usize, &&str)| {
             let sha256 = Sha256::of(text.as_bytes());
-            json!({"snapshot": snapshot, "files": [{"name": "frames.npy", "sha256": sha256}]})
+            json!({"snapshot": snapshot, "files": [{"name": "frames.npy", "size": 4, "sha256": sha256}]})
         };
         let snapshots: Vec<Value> = frames.iter().enumerate().map(entry).collect();
         json!({
-            "schema": super::SCHEMA,
+            "schema": super::JOB_SCHEMA,
             "content": {
                 "program_version": "1",
                 "inputs": {"masks_sha256": Sha256::of(b"masks"), "calibration": {}, "measurement": {}},

@@ -17,8 +17,8 @@ use super::stop::{stop_signal, stopped};
 use super::supervisor::Supervisor;
 use crate::audit::AuditLog;
 use crate::config::{
-    ClusterArguments, ConfigError, DeviceState, EngineArguments, RemoteArguments, ServeArguments,
-    Takes, VERSION, WorkerArguments,
+    ClusterArguments, DeviceState, EngineArguments, RemoteArguments, ServeArguments, Takes,
+    VERSION, WorkerArguments,
 };
 use crate::http::{App, Machine, Metrics, listen, router};
 use engine::pipeline::networks::{NetworkError, NetworkSource};
@@ -52,9 +52,13 @@ impl Announcement {
 
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// A setting is wrong.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
+    /// The service would be open to everyone.
+    #[error(
+        "{0} can be reached from other machines, and everyone could do everything: create a token \
+        (sci-recon token create), listen on 127.0.0.1, or set --allow-remote if the network is \
+        trusted"
+    )]
+    Exposed(SocketAddr),
     /// The device can't be read, or the folder of networks is not one.
     #[error(transparent)]
     Networks(#[from] NetworkError),
@@ -96,7 +100,9 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     })?;
     let accept_database = settings.accept_database;
     let store = Store::open(&settings.data, Purpose::Serve { accept_database }).await?;
-    settings.check(store.is_open().await?)?;
+    if settings.is_exposed(store.is_open().await?) {
+        return Err(ServeError::Exposed(settings.listen));
+    }
     let networks = settings.engine.source()?;
     // 2. Clean up after an earlier server.
     let swept = store.dir().sweep_tmp()?;
@@ -197,7 +203,7 @@ fn announce(root: &Path, address: SocketAddr, settings: &ServeArguments) -> Resu
     writeln!(stdout, "{text}").and_then(|()| stdout.flush()).map_err(io("print the address"))
 }
 
-/// Limit of a worker's address space in bytes, for the largest planned resident memory.
+/// Limit of a worker's data (`RLIMIT_DATA`) in bytes, for the largest planned resident memory.
 fn allowance(planned: u64) -> u64 {
     planned.saturating_add(planned / 4).saturating_add(256 << 20)
 }

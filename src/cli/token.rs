@@ -1,17 +1,15 @@
 //! `sci-recon token`: manages the access tokens of labs.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
 
 use super::CliError;
-use super::audited::{Change, audit_log, audited};
+use super::audited::{Change, FolderArguments, audited};
 use super::output::print_line;
 use super::wait::wait;
 use crate::audit::AuditLog;
 use crate::cli::error::Result;
-use crate::config::AuditArguments;
 use engine::job::{Lab, Label, Role, Secret, Timestamp, TokenId};
 use store::{Purpose, Store, StoreError, Token};
 
@@ -20,11 +18,8 @@ use store::{Purpose, Store, StoreError, Token};
 /// Once a token exists, the service refuses requests without one.
 #[derive(Debug, Args)]
 pub struct Arguments {
-    /// Folder of the service's data; the service may be running.
-    #[arg(long, env = "SCI_RECON_DATA", value_name = "DIR")]
-    data: PathBuf,
     #[command(flatten)]
-    audit: AuditArguments,
+    folder: FolderArguments,
     #[command(subcommand)]
     action: Action,
 }
@@ -47,8 +42,8 @@ struct Create {
     /// The lab that the token gives access to. Data that were created without a token belong to `local`.
     #[arg(long, value_name = "NAME")]
     lab: Lab,
-    /// read: view and download; submit: also upload, request jobs, cancel and delete; admin: also view the metrics of
-    /// the whole service.
+    /// read: view and download; submit: also upload, request jobs, cancel and delete; admin: also view /metrics and
+    /// /v1/system, and give jobs a priority above 0.
     #[arg(long, value_name = "ROLE", default_value = "submit")]
     role: Role,
     /// Give access to all labs; with the role admin, also to their limits.
@@ -70,7 +65,7 @@ struct Create {
 
 pub fn run(arguments: &Arguments) -> Result<()> {
     wait(async {
-        let log = audit_log(&arguments.audit, &arguments.data)?;
+        let log = arguments.folder.log()?;
         let store = open(arguments).await?;
         let text = act(&store, &log, &arguments.action).await?;
         // This makes earlier copies of the database, which have other tokens, recognizable.
@@ -87,9 +82,10 @@ async fn open(arguments: &Arguments) -> Result<Store> {
         Action::Create(create) => Some(create.new),
         _ => None,
     };
-    match (Store::open(&arguments.data, Purpose::Use).await, create) {
+    match (Store::open(&arguments.folder.data, Purpose::Use).await, create) {
         (Err(StoreError::NoFolder(_)), Some(true)) => {
-            Ok(Store::open(&arguments.data, Purpose::Serve { accept_database: false }).await?)
+            Ok(Store::open(&arguments.folder.data, Purpose::Serve { accept_database: false })
+                .await?)
         }
         (Err(error @ StoreError::NoFolder(_)), Some(false)) => {
             Err(CliError::Input(format!("{error}; create it with --new")))

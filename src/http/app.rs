@@ -4,12 +4,15 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::extract::FromRef;
+use axum::http::header;
 use quick_cache::sync::Cache;
-use tokio::sync::{Mutex, watch};
+use serde::Serialize;
+use tokio::sync::{Mutex, OwnedMutexGuard, watch};
 use tokio_util::sync::CancellationToken;
 
 use super::admission::Admission;
-use super::context::Wait;
+use super::conditional;
+use super::context::{RequestContext, Wait};
 use super::error::Result;
 use super::events::Events;
 use super::metrics::Metrics;
@@ -19,7 +22,7 @@ use super::revocation::Revocations;
 use super::shares::{Changes, Turns};
 use crate::audit::AuditLog;
 use crate::config::{DeviceState, ServeArguments};
-use engine::job::{Timestamp, TokenId, without_paths};
+use engine::job::{Lab, Timestamp, TokenId, without_paths};
 use engine::pipeline::networks::NetworkSource;
 use engine::pipeline::quality::Quality;
 use formats::Limits;
@@ -111,6 +114,21 @@ impl App {
 }
 
 impl App {
+    /// Checks `If-Match` of a request that changes or deletes something; `current` gives its representation. No
+    /// other request changes anything of the lab until the guard is dropped.
+    pub(super) async fn precondition<T: Serialize>(
+        &self,
+        request: &RequestContext,
+        lab: &Lab,
+        current: impl Future<Output = Result<T>>,
+    ) -> Result<OwnedMutexGuard<()>> {
+        let guard = self.changes.lock(lab).await;
+        if request.headers.contains_key(header::IF_MATCH) {
+            conditional::check_match(&request.headers, &conditional::etag_of(&current.await?)?)?;
+        }
+        Ok(guard)
+    }
+
     /// How long a GET waits that prefers to; none for not at all. A proxy, or the limit on the time of answers, must not
     /// come first.
     pub(super) fn wait(&self, wait: Wait) -> Option<Duration> {

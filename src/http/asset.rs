@@ -1,6 +1,6 @@
 //! Documents that the program contains.
 
-use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::http::{HeaderMap, HeaderValue, header};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
@@ -24,23 +24,14 @@ impl Asset {
 
     /// The document, 304 or 412.
     pub(super) fn answer(&self, headers: &HeaderMap) -> Result<Response> {
-        conditional::check_match(headers, &self.etag)?;
-        let known = conditional::is_known(headers, &self.etag);
-        let mut response = match known {
-            true => StatusCode::NOT_MODIFIED.into_response(),
-            false => self.bytes.clone().into_response(),
-        };
-        let fields = response.headers_mut();
-        let mut set = |name: HeaderName, value: &'static str| {
-            fields.insert(name, HeaderValue::from_static(value));
-        };
-        set(header::CONTENT_TYPE, self.kind);
-        // The browser revalidates every file, so it never mixes old and new modules after an update.
-        set(header::CACHE_CONTROL, "no-cache");
-        if let Ok(etag) = HeaderValue::try_from(&self.etag) {
-            fields.insert(header::ETAG, etag);
-        }
-        Ok(response)
+        let fields = [
+            (header::ETAG, self.etag.clone()),
+            (header::CONTENT_TYPE, self.kind.into()),
+            // The browser revalidates every file, so it never mixes old and new modules after an update.
+            (header::CACHE_CONTROL, "no-cache".into()),
+        ];
+        let known = conditional::not_modified(headers, &self.etag, fields.clone())?;
+        Ok(known.unwrap_or_else(|| (fields, self.bytes.clone()).into_response()))
     }
 
     /// As [`Self::answer`], for a page of this service or a file of one, with its content security policy.

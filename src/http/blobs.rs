@@ -109,8 +109,7 @@ pub(super) async fn delete(
     Params(sha256): Params<Sha256>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access, sha256)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access, sha256)).await?;
     app.store.delete_upload(&access.lab, sha256).await?;
     Ok(StatusCode::NO_CONTENT)
 }

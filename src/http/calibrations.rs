@@ -11,13 +11,13 @@ use super::download::{Download, stream_range};
 use super::error::{Problem, Result};
 use super::extract::{Caller, Params, QueryOf};
 use super::page::{Cursor, Limit};
-use super::submissions::{Shown, Stage, page, pending};
+use super::submissions::{ResourceApi, Stage, page, pending};
 use engine::job::{
     CalibrationId, CalibrationRequest, Dispersion, JobId, Label, Mosaic, Reading, Sha256,
     Submission, Timestamp,
 };
 use formats::{Channels, npy, planar};
-use store::{Asked, Filter, Span};
+use store::{Filter, FoundResource, Span};
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -80,15 +80,15 @@ struct CalibrationFacts {
     registration_of: Option<JobId>,
 }
 
-impl Shown for CalibrationId {
+impl ResourceApi for CalibrationId {
     const PATH: &'static str = "/v1/calibrations";
     const SUBMISSION: fn(CalibrationRequest) -> Submission = Submission::Calibration;
     type Body = CalibrationBody;
 
-    fn body(asked: Asked<Self>) -> Result<CalibrationBody> {
-        let request = match asked {
-            Asked::Pending(request) => *request,
-            Asked::Ready(calibration) => {
+    fn body(found: FoundResource<Self>) -> Result<CalibrationBody> {
+        let request = match found {
+            FoundResource::Pending(request) => *request,
+            FoundResource::Ready(calibration) => {
                 let facts = calibration.facts;
                 return Ok(CalibrationBody {
                     id: calibration.id,

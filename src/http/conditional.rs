@@ -1,6 +1,6 @@
 //! Conditional and partial requests (RFC 9110): `If-Match`, `If-None-Match`, `If-Range` and `Range`.
 
-use axum::http::{HeaderMap, HeaderName, Method, StatusCode, header};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use headers::{ETag, HeaderMapExt, IfMatch, IfNoneMatch};
 use serde::Serialize;
@@ -14,7 +14,7 @@ pub(super) fn etag(sha256: &Sha256) -> String {
 }
 
 /// True if the client has the content with this ETag (`If-None-Match`, compared weakly).
-pub(super) fn is_known(headers: &HeaderMap, etag: &str) -> bool {
+fn is_known(headers: &HeaderMap, etag: &str) -> bool {
     match (headers.typed_get::<IfNoneMatch>(), etag.parse::<ETag>()) {
         (Some(known), Ok(etag)) => !known.precondition_passes(&etag),
         _ => false,
@@ -40,17 +40,39 @@ pub(super) fn etag_of<T: Serialize>(body: &T) -> Result<String> {
     Ok(etag(&Sha256::of(&text)))
 }
 
+/// The answer 304 with `fields`, if the client has the content with this ETag.
+///
+/// Errors: 412 if `If-Match` does not contain the ETag.
+pub(super) fn not_modified<const N: usize>(
+    headers: &HeaderMap,
+    etag: &str,
+    fields: [(HeaderName, String); N],
+) -> Result<Option<Response>> {
+    check_match(headers, etag)?;
+    let known = is_known(headers, etag);
+    Ok(known.then(|| (StatusCode::NOT_MODIFIED, fields).into_response()))
+}
+
 /// Answers with content and its ETag, or with 304 if the client has it.
 pub(super) fn content(headers: &HeaderMap, kind: &'static str, bytes: Vec<u8>) -> Response {
     let etag = etag(&Sha256::of(&bytes));
-    if let Err(error) = check_match(headers, &etag) {
-        return error.into_response();
-    }
     let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "private, no-cache".into())];
-    if is_known(headers, &etag) {
-        return (StatusCode::NOT_MODIFIED, tags).into_response();
+    match not_modified(headers, &etag, tags.clone()) {
+        Ok(Some(known)) => known,
+        Ok(None) => (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response(),
+        Err(error) => error.into_response(),
     }
-    (tags, [(header::CONTENT_TYPE, kind)], bytes).into_response()
+}
+
+/// Answers with a page that loads the style sheet and pictures of the service, and no scripts.
+pub(super) fn page(headers: &HeaderMap, text: String) -> Response {
+    const POLICY: HeaderValue = HeaderValue::from_static(
+        "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; form-action 'none'; \
+         frame-ancestors 'none'",
+    );
+    let mut response = content(headers, "text/html; charset=utf-8", text.into_bytes());
+    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, POLICY);
+    response
 }
 
 /// Answers with a JSON body and its ETag, or with 304 if the client has it.

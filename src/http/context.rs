@@ -8,12 +8,9 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, Uri, header};
 use axum::response::Response;
 use serde::Serialize;
-use tokio::sync::OwnedMutexGuard;
 
 use super::conditional;
 use super::error::{ApiError, Result};
-use super::shares::Changes;
-use engine::job::Lab;
 
 const PREFER: HeaderName = HeaderName::from_static("prefer");
 const APPLIED: HeaderName = HeaderName::from_static("preference-applied");
@@ -65,21 +62,6 @@ impl RequestContext {
         let cursor = format!("cursor={cursor}");
         let query: Vec<&str> = kept.chain([cursor.as_str()]).collect();
         format!("<?{}>; rel=\"next\"", query.join("&"))
-    }
-
-    /// Checks `If-Match` of a request that changes or deletes something; `current` gives its representation. No
-    /// other request changes anything of the lab until the guard is dropped.
-    pub(super) async fn precondition<T: Serialize>(
-        &self,
-        changes: &Changes,
-        lab: &Lab,
-        current: impl Future<Output = Result<T>>,
-    ) -> Result<OwnedMutexGuard<()>> {
-        let guard = changes.lock(lab).await;
-        if self.headers.contains_key(header::IF_MATCH) {
-            conditional::check_match(&self.headers, &conditional::etag_of(&current.await?)?)?;
-        }
-        Ok(guard)
     }
 
     /// The wait that the request prefers (RFC 7240).

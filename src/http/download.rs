@@ -45,9 +45,9 @@ impl Download {
         (method, headers): (&Method, &HeaderMap),
     ) -> Result<Response> {
         let etag = conditional::etag(&self.sha256);
-        conditional::check_match(headers, &etag)?;
-        if conditional::is_known(headers, &etag) {
-            return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
+        let tag = [(header::ETAG, etag.clone())];
+        if let Some(known) = conditional::not_modified(headers, &etag, tag)? {
+            return Ok(known);
         }
         let (status, start, length) = self.portion(&etag, (method, headers))?;
         let mut response = (status, read(start, length).await?).into_response();

@@ -50,9 +50,9 @@ codes! {
     Unauthorized: StatusCode::UNAUTHORIZED, "Authentication required", false,
         "Send a token as Authorization: Bearer. Unknown, misspelled, expired and revoked tokens get the same \
          answer. An administrator of the service can create a new token.";
-    Forbidden: StatusCode::FORBIDDEN, "Role of the token is too low", false,
-        "The role of the token is too low. Role read may read, submit may also change, and admin may access all \
-         labs.";
+    Forbidden: StatusCode::FORBIDDEN, "Token does not permit the request", false,
+        "The role of the token is too low, or the token is for one lab only. Role read may read, submit may also change, \
+         and admin may also read the metrics. A token for all labs may name another lab.";
     ForeignSite: StatusCode::FORBIDDEN, "Request from another site", false,
         "A service without tokens answers only requests to its own host names, and rejects changes from pages of \
          other sites. Use the address of the service, create a token, or start the service with --host NAME.";
@@ -196,8 +196,8 @@ pub struct Problem {
     #[serde(skip_serializing_if = "Option::is_none")]
     instance: Option<String>,
     /// With `invalid_content`, the fault of the file: `unknown_format`, `unsupported_content`, `truncated`, `malformed`,
-    /// `over_limit`, `missing_array`, `axes_ambiguous`, `no_axes`, `invalid_full_scale`, `not_finite`,
-    /// `above_full_scale`, `all_masks_zero`, `mask_frame_zero` or `snapshot_zero`.
+    /// `over_limit`, `missing_array`, `axes_ambiguous`, `no_axes`, `invalid_part`, `invalid_full_scale`,
+    /// `not_finite`, `above_full_scale`, `bipolar_masks`, `all_masks_zero`, `mask_frame_zero` or `snapshot_zero`.
     #[serde(skip_serializing_if = "Option::is_none")]
     reason: Option<String>,
     /// JSON pointer to the first of `errors`.

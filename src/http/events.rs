@@ -21,8 +21,8 @@ use tokio_util::sync::CancellationToken;
 use super::access::Access;
 use super::error::{ApiError, Code, Result};
 use super::shares::{Place, Places};
-use engine::job::{JobId, Lab, ThingId};
-use store::{Changes, Made, Store, StoreError};
+use engine::job::{JobId, Lab, ResourceId};
+use store::{Changes, ResourceKind, Store, StoreError};
 
 /// Longest time between two reads of the changes.
 const MAX_INTERVAL: Duration = Duration::from_secs(1);
@@ -52,7 +52,8 @@ type LabEvents = [HashMap<Lab, String>; 4];
 
 /// The kinds of resources that events are about. Listeners do not get those of models; requests wait for the check of a
 /// model with them.
-const KINDS: [Made; 4] = [Made::Job, Made::Calibration, Made::Measurement, Made::Model];
+const KINDS: [ResourceKind; 4] =
+    [ResourceKind::Job, ResourceKind::Calibration, ResourceKind::Measurement, ResourceKind::Model];
 /// The names of the events that listeners get, in the order of [`KINDS`].
 const NAMES: [&str; 3] = ["jobs", "calibrations", "measurements"];
 
@@ -91,7 +92,7 @@ impl Events {
         time: Duration,
     ) -> Result<()> {
         let ended = || async { Ok(store.job_state(lab, job).await?.is_final()) };
-        self.until(lab, time, (Made::Job, job.to_string()), ended).await
+        self.until(lab, time, (ResourceKind::Job, job.to_string()), ended).await
     }
 
     /// Waits until a calibration, measurement or model is ready or rejected.
@@ -99,7 +100,7 @@ impl Events {
         &self,
         store: &Store,
         lab: &Lab,
-        (what, id): (Made, ThingId),
+        (what, id): (ResourceKind, ResourceId),
         time: Duration,
     ) -> Result<()> {
         let settled = || async { Ok(store.is_settled(lab, id).await?) };
@@ -111,7 +112,7 @@ impl Events {
         &self,
         store: &Store,
         lab: &Lab,
-        (what, id): (Made, ThingId),
+        (what, id): (ResourceKind, ResourceId),
         time: Duration,
     ) -> Result<()> {
         let checked = || async { Ok(store.is_checked(id).await?) };
@@ -124,7 +125,7 @@ impl Events {
         &self,
         lab: &Lab,
         time: Duration,
-        (what, name): (Made, String),
+        (what, name): (ResourceKind, String),
         settled: impl Fn() -> F,
     ) -> Result<()> {
         let _place = self.waiters.take(lab, time)?;
@@ -256,7 +257,7 @@ async fn lab_events(store: &Store, changes: Changes) -> Result<LabEvents, StoreE
         return Ok(to_json(by_kind));
     };
     for item in items {
-        let is_of = |kind: &Made| kind.into_str() == item.what;
+        let is_of = |kind: &ResourceKind| kind.into_str() == item.what;
         let Some(kind) = KINDS.iter().position(is_of) else { continue };
         let change = by_kind[kind].entry(item.lab).or_default();
         if item.exists { &mut change.changed } else { &mut change.deleted }.push(item.id);

@@ -24,8 +24,8 @@ use engine::job::{
     TileSpec, Timestamp, Webhook, priority_error,
 };
 use store::{
-    Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, Made,
-    NewJob, Page, RequestKey, Span, StoreError,
+    Estimate, FailedTask, FailureCause, Inserted, Job, JobChanges, JobFilter, JobProgress, NewJob,
+    Page, RequestKey, ResourceKind, Span, StoreError,
 };
 
 /// A job with its progress.
@@ -56,7 +56,8 @@ pub(super) struct JobBody {
     priority: i32,
     /// The upload with the true frames; null if they are unknown.
     truth: Option<Sha256>,
-    /// Findings of the check of the measurement, `bad_calibration`, `moved_masks` and `misplaced_masks`.
+    /// Findings of the check of the measurement, `bad_calibration`, `moved_masks` and `misplaced_masks`; while no worker takes
+    /// tiles, `no_tile_workers`.
     warnings: Vec<Finding>,
     /// The failure in words.
     error: Option<String>,
@@ -305,10 +306,11 @@ pub(super) async fn make(
     request: JobRequest,
     key: Option<RequestKey>,
 ) -> Result<(StatusCode, JobBody)> {
-    let inserted = match app.store.made_with(&access.lab, Made::Job, key.as_ref()).await? {
-        Some(id) => Inserted::Before(id),
-        None => insert(app, access, request, key).await?,
-    };
+    let inserted =
+        match app.store.created_with(&access.lab, ResourceKind::Job, key.as_ref()).await? {
+            Some(id) => Inserted::Before(id),
+            None => insert(app, access, request, key).await?,
+        };
     let (status, id) = created(inserted);
     Ok((status, body(app, &access.lab, id).await?))
 }
@@ -526,8 +528,7 @@ pub(super) async fn change(
     if let Some(error) = invalid {
         return Err(ApiError::fields(Code::InvalidRequest, vec![error]));
     }
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     if let Some(Some(sha256)) = truth {
         let shape = app.store.job(&access.lab, id).await?.spec.frame_shape();
         truth::check(&app, &access.lab, sha256, shape).await?;
@@ -560,8 +561,7 @@ pub(super) async fn cancel(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<Response> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.cancel_job(&access.lab, id).await?;
     let body = body(&app, &access.lab, id).await?;
     // A running tile stops after the iteration that it is in.
@@ -575,8 +575,7 @@ pub(super) async fn retry(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<Response> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.retry_job(&access.lab, id).await?;
     let body = body(&app, &access.lab, id).await?;
     accepted(&body, body.progress.eta_seconds)
@@ -596,8 +595,7 @@ pub(super) async fn delete(
     Params(id): Params<JobId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.delete_job(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }

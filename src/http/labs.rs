@@ -104,7 +104,7 @@ pub(super) async fn change(
     if !errors.is_empty() {
         return Err(ApiError::fields(Code::InvalidRequest, errors));
     }
-    let _guard = request.precondition(&app.changes, &lab, one(&app, lab.as_str())).await?;
+    let _guard = app.precondition(&request, &lab, one(&app, lab.as_str())).await?;
     app.store.entitle(&lab, Entitlement { share, max_bytes: bytes, max_jobs: jobs }).await?;
     changed(StatusCode::OK, &one(&app, lab.as_str()).await?)
 }

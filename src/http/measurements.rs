@@ -3,12 +3,12 @@
 use serde::Serialize;
 
 use super::error::{Problem, Result};
-use super::submissions::{Shown, Stage, pending};
+use super::submissions::{ResourceApi, Stage, pending};
 use engine::job::{
     CalibrationId, Finding, Label, MeasurementId, MeasurementRequest, Reading, Sequence, Sha256,
     Submission, Timestamp,
 };
-use store::{Asked, StoreError};
+use store::{FoundResource, StoreError};
 
 /// A measurement. Facts about its data are null until they are checked.
 #[derive(Debug, Serialize, schemars::JsonSchema)]
@@ -54,15 +54,15 @@ struct MeasurementFacts {
     reading: Option<Reading>,
 }
 
-impl Shown for MeasurementId {
+impl ResourceApi for MeasurementId {
     const PATH: &'static str = "/v1/measurements";
     const SUBMISSION: fn(MeasurementRequest) -> Submission = Submission::Measurement;
     type Body = MeasurementBody;
 
-    fn body(asked: Asked<Self>) -> Result<MeasurementBody> {
-        let request = match asked {
-            Asked::Pending(request) => *request,
-            Asked::Ready(measurement) => {
+    fn body(found: FoundResource<Self>) -> Result<MeasurementBody> {
+        let request = match found {
+            FoundResource::Pending(request) => *request,
+            FoundResource::Ready(measurement) => {
                 let facts = measurement.facts;
                 return Ok(MeasurementBody {
                     id: measurement.id,

@@ -49,7 +49,6 @@ mod samples;
 mod session;
 mod shares;
 mod sign_ins;
-mod strict;
 mod submissions;
 mod system;
 mod throttle;

@@ -6,12 +6,12 @@ use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-use super::context::{RequestContext, changed};
+use super::context::changed;
 use super::error::{ApiError, Code, Result};
-use super::extract::{Body, Caller, Params, created, request_key};
-use super::submissions::{Shown, body, make};
+use super::extract::{Body, Caller, created, request_key};
+use super::submissions::{ResourceApi, make};
 use engine::job::{Label, ModelId, ModelRequest, Submission, Timestamp};
-use store::{Asked, NewModel, StoreError};
+use store::{FoundResource, NewModel, StoreError};
 
 /// Time for which a request waits for the check of a network, including checks that run before it. A client can't poll a
 /// pending model, because it has no state.
@@ -27,21 +27,21 @@ pub(super) struct ModelBody {
     facts: NewModel,
 }
 
-impl Shown for ModelId {
+impl ResourceApi for ModelId {
     const PATH: &'static str = "/v1/models";
     const SUBMISSION: fn(ModelRequest) -> Submission = Submission::Model;
     type Body = ModelBody;
 
     /// Errors: 404 if the network has not passed its check.
-    fn body(asked: Asked<Self>) -> Result<ModelBody> {
-        match asked {
-            Asked::Ready(model) => Ok(ModelBody {
+    fn body(found: FoundResource<Self>) -> Result<ModelBody> {
+        match found {
+            FoundResource::Ready(model) => Ok(ModelBody {
                 id: model.id,
                 created_at: model.created_at,
                 name: model.name,
                 facts: model.facts,
             }),
-            Asked::Pending(request) => {
+            FoundResource::Pending(request) => {
                 Err(StoreError::NotFound { what: "model", id: request.id.to_string() }.into())
             }
         }
@@ -57,18 +57,10 @@ pub(super) async fn create(
     let inserted = make(&app, &access, Submission::Model(request), key.as_ref(), PATIENCE).await?;
     let (status, id) = created::<ModelId>(inserted);
     let location = [(header::LOCATION, format!("/v1/models/{id}"))];
-    let asked = app.store.asked(&access.lab, id).await?;
-    if let Asked::Pending(_) = asked {
+    let found = app.store.resource(&access.lab, id).await?;
+    if let FoundResource::Pending(_) = found {
         let detail = "the check of the network takes long: send the request again, with an Idempotency-Key, to wait for it";
         return Err(ApiError::new(Code::TimedOut, detail));
     }
-    Ok((location, changed(status, &ModelId::body(asked)?)?).into_response())
-}
-
-pub(super) async fn show(
-    Caller(app, access): Caller,
-    Params(id): Params<ModelId>,
-    request: RequestContext,
-) -> Result<Response> {
-    request.json(&body(&app, &access.lab, id).await?)
+    Ok((location, changed(status, &ModelId::body(found)?)?).into_response())
 }

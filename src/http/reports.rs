@@ -1,6 +1,6 @@
 //! The report of a calibration: as JSON, as a page, and its maps as PNG.
 
-use axum::http::{HeaderMap, header};
+use axum::http::HeaderMap;
 use axum::response::Response;
 
 use super::app::App;
@@ -9,10 +9,6 @@ use super::error::{ApiError, Code, Result};
 use super::extract::{Caller, Params};
 use engine::intake::report_page;
 use engine::job::{CalibrationId, CalibrationReport, Lab};
-
-/// Content security policy: the browser loads the style sheet and pictures of the service, and no scripts.
-const POLICY: &str = "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; \
-     form-action 'none'; frame-ancestors 'none'";
 
 pub(super) async fn json(
     Caller(app, access): Caller,
@@ -31,11 +27,7 @@ pub(super) async fn html(
     let report = report(&app, &access.lab, id).await?;
     let name = app.store.calibration(&access.lab, id).await?.name;
     let title = name.map_or_else(|| id.to_string(), |name| name.as_str().to_owned());
-    let text = report_page(&title, &report).into_bytes();
-    let mut response = conditional::content(&headers, "text/html; charset=utf-8", text);
-    let policy = header::HeaderValue::from_static(POLICY);
-    response.headers_mut().insert(header::CONTENT_SECURITY_POLICY, policy);
-    Ok(response)
+    Ok(conditional::page(&headers, report_page(&title, &report)))
 }
 
 pub(super) async fn map(

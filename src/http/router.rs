@@ -18,14 +18,14 @@ use super::access::{self, Rule};
 use super::app::App;
 use super::client_places;
 use super::listen::connection_limit;
-use super::pictures::{OfBlob, OfCalibration, OfJob, OfMeasurement};
+use super::pictures::{Of, OfJob};
 use super::shares::Places;
 use super::{
     algorithms, audit, blobs, calibrations, contract, dashboard, events, exports, jobs, labs,
     layers, me, models, observation, origins, pictures, problems, quality, reference, reports,
     results, samples, session, submissions, system, tiles, tus,
 };
-use engine::job::{CalibrationId, MeasurementId, ModelId};
+use engine::job::{CalibrationId, MeasurementId, ModelId, Sha256};
 
 /// Requests in progress. Two addresses with all their connections do not reach it.
 const MOST_REQUESTS: usize = 4096;
@@ -52,7 +52,7 @@ pub fn routes() -> Vec<Route> {
         R::at("/v1/measurements").get(submissions::list::<MeasurementId>).query().post(submissions::create::<MeasurementId>).slow(),
         R::at("/v1/measurements/{measurement}").get(submissions::show::<MeasurementId>).patch(submissions::rename::<MeasurementId>).delete(submissions::delete::<MeasurementId>),
         R::at("/v1/models").get(submissions::list::<ModelId>).query().post(models::create).slow(),
-        R::at("/v1/models/{model}").get(models::show).patch(submissions::rename::<ModelId>).delete(submissions::delete::<ModelId>),
+        R::at("/v1/models/{model}").get(submissions::show::<ModelId>).patch(submissions::rename::<ModelId>).delete(submissions::delete::<ModelId>),
         R::at("/v1/algorithms").get(algorithms::list),
         R::at("/v1/jobs").get(jobs::list).query().post(jobs::create).only(Rule::AcrossLabs),
         R::at("/v1/samples").post(samples::create),
@@ -83,17 +83,17 @@ pub fn routes() -> Vec<Route> {
         R::at("/openapi.yaml").get(contract::yaml).only(Rule::Public),
         R::at("/openapi.json").get(contract::json).only(Rule::Public),
         R::at("/view/session").post(session::create).delete(session::delete).query().only(Rule::Own),
-        R::at("/view/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<OfBlob>).query().slow(),
+        R::at("/view/blobs/{sha256}/pictures/{picture}").get(pictures::preview::<Of<Sha256>>).query().slow(),
         R::at("/view/calibrations/{calibration}/report.html").get(reports::html),
         R::at("/view/calibrations/{calibration}/maps/{map}").get(reports::map),
-        R::at("/view/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<OfCalibration>).query().slow(),
-        R::at("/view/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<OfCalibration>).slow(),
-        R::at("/view/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfCalibration>).query().slow(),
-        R::at("/view/calibrations/{calibration}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfCalibration>).slow(),
-        R::at("/view/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<OfMeasurement>).query().slow(),
-        R::at("/view/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<OfMeasurement>).slow(),
-        R::at("/view/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfMeasurement>).query().slow(),
-        R::at("/view/measurements/{measurement}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<OfMeasurement>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}").get(pictures::preview::<Of<CalibrationId>>).query().slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/spread").get(pictures::spread::<Of<CalibrationId>>).slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<Of<CalibrationId>>).query().slow(),
+        R::at("/view/calibrations/{calibration}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<Of<CalibrationId>>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}").get(pictures::preview::<Of<MeasurementId>>).query().slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/spread").get(pictures::spread::<Of<MeasurementId>>).slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<Of<MeasurementId>>).query().slow(),
+        R::at("/view/measurements/{measurement}/pictures/{picture}/values/{level}/{row}/{column}").get(pictures::values::<Of<MeasurementId>>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}").get(pictures::preview::<OfJob>).query().slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/spread").get(pictures::spread::<OfJob>).slow(),
         R::at("/view/jobs/{job}/snapshots/{snapshot}/pictures/{picture}/tiles/{level}/{row}/{column}").get(pictures::tile::<OfJob>).query().slow(),

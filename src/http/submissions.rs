@@ -15,9 +15,10 @@ use super::context::{RequestContext, changed};
 use super::error::{ApiError, Code, Problem, REQUEST_ID, Result};
 use super::extract::{Body, Caller, Params, QueryOf, created, request_key};
 use super::page::{Limit, ListQuery, PageBody, Renaming};
-use engine::job::{CheckLimits, InvalidId, JobState, Lab, Submission, ThingId};
+use engine::job::{CheckLimits, InvalidId, JobState, Lab, ResourceId, Submission};
 use store::{
-    Asked, Filter, Inserted, Made, NewRequest, Page, Request, RequestKey, Resource, StoreError,
+    Filter, FoundResource, Inserted, NewRequest, Page, Request, RequestKey, Resource, ResourceKind,
+    StoreError,
 };
 
 /// Default time for which a request waits for a check.
@@ -37,16 +38,16 @@ pub(super) enum Stage {
 }
 
 /// A kind of resource that is made from uploads: its identifiers, and its requests and answers.
-pub(super) trait Shown: Resource + DeserializeOwned + 'static {
+pub(super) trait ResourceApi: Resource + DeserializeOwned + 'static {
     /// The address of the list.
     const PATH: &'static str;
     const SUBMISSION: fn(Self::Request) -> Submission;
     type Body: Serialize + Send;
 
-    fn body(asked: Asked<Self>) -> Result<Self::Body>;
+    fn body(found: FoundResource<Self>) -> Result<Self::Body>;
 }
 
-pub(super) async fn create<Id: Shown>(
+pub(super) async fn create<Id: ResourceApi>(
     Caller(app, access): Caller,
     context: RequestContext,
     Body(request): Body<Id::Request>,
@@ -55,18 +56,18 @@ pub(super) async fn create<Id: Shown>(
     let submission = Id::SUBMISSION(request);
     let inserted = make(&app, &access, submission, key.as_ref(), wait.time(PATIENCE)).await?;
     let (status, id) = created::<Id>(inserted);
-    let asked = app.store.asked(&access.lab, id).await?;
-    let is_ready = matches!(asked, Asked::Ready(_));
+    let found = app.store.resource(&access.lab, id).await?;
+    let is_ready = matches!(found, FoundResource::Ready(_));
     let status = if is_ready { status } else { StatusCode::ACCEPTED };
     let location = [(header::LOCATION, format!("{}/{id}", Id::PATH))];
-    Ok(wait.applied((location, changed(status, &Id::body(asked)?)?).into_response()))
+    Ok(wait.applied((location, changed(status, &Id::body(found)?)?).into_response()))
 }
 
-pub(super) async fn body<Id: Shown>(app: &App, lab: &Lab, id: Id) -> Result<Id::Body> {
-    Id::body(app.store.asked(lab, id).await?)
+pub(super) async fn body<Id: ResourceApi>(app: &App, lab: &Lab, id: Id) -> Result<Id::Body> {
+    Id::body(app.store.resource(lab, id).await?)
 }
 
-pub(super) async fn list<Id: Shown>(
+pub(super) async fn list<Id: ResourceApi>(
     caller: Caller,
     QueryOf(query): QueryOf<ListQuery<Id>>,
     request: RequestContext,
@@ -75,22 +76,22 @@ pub(super) async fn list<Id: Shown>(
 }
 
 /// A page of a list.
-pub(super) async fn page<Id: Shown>(
+pub(super) async fn page<Id: ResourceApi>(
     Caller(app, access): Caller,
     (limit, filter): (Limit, Filter<Id>),
     request: &RequestContext,
 ) -> Result<Response> {
-    let Page { items, more } = app.store.things(&access.lab, filter, limit.get()).await?;
-    let id = |asked: &Asked<Id>| match asked {
-        Asked::Ready(thing) => thing.id.to_string(),
-        Asked::Pending(request) => request.id.to_string(),
+    let Page { items, more } = app.store.resources(&access.lab, filter, limit.get()).await?;
+    let id = |found: &FoundResource<Id>| match found {
+        FoundResource::Ready(resource) => resource.id.to_string(),
+        FoundResource::Pending(request) => request.id.to_string(),
     };
-    let shown = |asked| Ok((id(&asked), Id::body(asked)?));
+    let shown = |found| Ok((id(&found), Id::body(found)?));
     let items = items.into_iter().map(shown).collect::<Result<Vec<_>>>()?;
     PageBody::new(Page { items, more }, |(id, _)| id.clone(), |(_, body)| body).answer(request)
 }
 
-pub(super) async fn show<Id: Shown>(
+pub(super) async fn show<Id: ResourceApi>(
     Caller(app, access): Caller,
     Params(id): Params<Id>,
     request: RequestContext,
@@ -103,25 +104,23 @@ pub(super) async fn show<Id: Shown>(
     Ok(wait.applied(request.json(&body(&app, &access.lab, id).await?)?))
 }
 
-pub(super) async fn rename<Id: Shown>(
+pub(super) async fn rename<Id: ResourceApi>(
     Caller(app, access): Caller,
     Params(id): Params<Id>,
     request: RequestContext,
     Body(renaming): Body<Renaming>,
 ) -> Result<Response> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.rename(&access.lab, id, renaming.name.as_ref()).await?;
     changed(StatusCode::OK, &body(&app, &access.lab, id).await?)
 }
 
-pub(super) async fn delete<Id: Shown>(
+pub(super) async fn delete<Id: ResourceApi>(
     Caller(app, access): Caller,
     Params(id): Params<Id>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, body(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, body(&app, &access.lab, id)).await?;
     app.store.delete(&access.lab, id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
@@ -151,13 +150,13 @@ pub(super) async fn make<Id>(
     patience: Duration,
 ) -> Result<Inserted<Id>>
 where
-    Id: Into<ThingId> + From<ThingId> + FromStr<Err = InvalidId> + Copy,
+    Id: Into<ResourceId> + From<ResourceId> + FromStr<Err = InvalidId> + Copy,
 {
     let invalid = |errors| ApiError::fields(Code::InvalidRequest, errors);
     submission.check().map_err(invalid)?;
-    let (lab, what) = (&access.lab, Made::of(&submission));
+    let (lab, what) = (&access.lab, ResourceKind::of(&submission));
     loop {
-        let inserted = match app.store.made_with(lab, what, key).await? {
+        let inserted = match app.store.created_with(lab, what, key).await? {
             Some(id) => Inserted::Before(id),
             None => submit(app, access, &submission, key).await?,
         };
@@ -188,7 +187,7 @@ async fn submit<Id>(
     key: Option<&RequestKey>,
 ) -> Result<Inserted<Id>>
 where
-    Id: From<ThingId> + FromStr<Err = InvalidId>,
+    Id: From<ResourceId> + FromStr<Err = InvalidId>,
 {
     check_references(app, &access.lab, submission).await?;
     let settings = &app.settings;
@@ -216,7 +215,7 @@ where
 async fn wait_for_check(
     app: App,
     lab: Lab,
-    (what, id): (Made, ThingId),
+    (what, id): (ResourceKind, ResourceId),
     is_new: bool,
     patience: Duration,
 ) -> Result<bool> {

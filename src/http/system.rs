@@ -248,7 +248,7 @@ async fn workers_live(app: &App) -> Result<(), String> {
     if live == 0 { Err("no worker lives".to_owned()) } else { Ok(()) }
 }
 
-/// `GET /metrics`. Figures of all labs are for administrators; other tokens get those of their lab.
+/// `GET /metrics`, for the role admin. Figures per lab cover the lab of the token, or all labs with a token for all labs.
 #[allow(clippy::cast_precision_loss)] // counts and bytes far below 2^53
 pub(super) async fn metrics(Caller(app, access): Caller) -> Result<Response> {
     for (state, count) in jobs(&app).await? {

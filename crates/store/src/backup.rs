@@ -9,7 +9,6 @@ use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::path::Path;
 
-use sha2::Digest;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{ConnectOptions, Connection};
 
@@ -18,7 +17,7 @@ use super::locked::LockedFile;
 use super::records::{self, Record};
 use super::{DataDir, Store, dir, identity, on_files};
 use crate::columns::sql;
-use engine::job::{PartialId, Sha256};
+use engine::job::{HashingWriter, PartialId, Sha256};
 
 /// So often the database is written out, at most: what is made and deleted within the moment that one
 /// writing takes makes another one necessary.
@@ -102,10 +101,7 @@ impl Store {
         frozen: &DataDir,
     ) -> Result<Option<Vec<String>>> {
         let (mut missing, mut after) = (Vec::new(), None);
-        loop {
-            let page = records::page(database, after.as_ref()).await?;
-            let Some(last) = page.last() else { break };
-            after = Some(last.place.clone());
+        while let Some(page) = records::next_page(database, &mut after).await? {
             let (live, names) = (self.dir().clone(), frozen.clone());
             let absent = on_files(move || {
                 let mut absent = Vec::new();
@@ -146,10 +142,7 @@ impl Store {
     ) -> Result<()> {
         let partials = records::partials(database).await?;
         let mut after = None;
-        loop {
-            let page = records::page(database, after.as_ref()).await?;
-            let Some(last) = page.last() else { break };
-            after = Some(last.place.clone());
+        while let Some(page) = records::next_page(database, &mut after).await? {
             let (live, frozen, to) = (self.dir().clone(), frozen.clone(), to.clone());
             let mut so_far = std::mem::take(backup);
             *backup = on_files(move || {
@@ -330,16 +323,13 @@ fn copy_partial(
 
 fn copy_file(from: &Path, to: &Path) -> Result<(Sha256, u64)> {
     let mut source = File::open(from).map_err(StoreError::io("open", from))?;
-    let mut copy = File::create_new(to).map_err(StoreError::io("make", to))?;
-    let (mut hasher, mut bytes, mut buffer) = (sha2::Sha256::new(), 0, vec![0; 256 * 1024]);
+    let copy = File::create_new(to).map_err(StoreError::io("make", to))?;
+    let (mut copy, mut buffer) = (HashingWriter::new(copy), vec![0; 256 * 1024]);
     loop {
         let count = source.read(&mut buffer).map_err(StoreError::io("read", from))?;
         if count == 0 {
-            break;
+            return Ok((copy.sha256(), copy.size()));
         }
-        hasher.update(&buffer[..count]);
         copy.write_all(&buffer[..count]).map_err(StoreError::io("write", to))?;
-        bytes += count as u64;
     }
-    Ok((Sha256::new(hasher.finalize().into()), bytes))
 }

@@ -7,8 +7,8 @@ use std::fmt::{self, Display};
 use std::marker::PhantomData;
 
 use engine::job::{
-    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, Mosaic, PartialId, Role,
-    Sequence, Sha256, TaskId, TaskStage, TaskState, ThingId, Timestamp, TokenId, WorkerId,
+    CalibrationId, JobId, JobState, Lab, Label, MeasurementId, ModelId, Mosaic, PartialId,
+    ResourceId, Role, Sequence, Sha256, TaskId, TaskStage, TaskState, Timestamp, TokenId, WorkerId,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -190,7 +190,7 @@ texts!(
     CalibrationId,
     MeasurementId,
     ModelId,
-    ThingId,
+    ResourceId,
     JobId,
     TaskId,
     PartialId,

@@ -1,18 +1,17 @@
 //! Hashes of stored files, remembered for as long as a file looks the same.
 
 use std::fs::{File, Metadata};
-use std::io::Read;
+use std::io::{Read, Sink, Write, sink};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::sync::Arc;
 
 use quick_cache::sync::Cache;
-use sha2::Digest;
 use tokio::sync::Semaphore;
 
 use super::error::{Result, StoreError};
 use super::on_files;
-use engine::job::Sha256;
+use engine::job::{HashingWriter, Sha256};
 
 /// Number of files whose hash is remembered.
 const REMEMBERED: usize = 65_536;
@@ -88,13 +87,13 @@ impl Hashes {
 #[derive(Debug)]
 pub(super) struct Hashing {
     pub(super) file: File,
-    hasher: sha2::Sha256,
+    hashed: HashingWriter<Sink>,
     slice: Vec<u8>,
 }
 
 impl Hashing {
     pub(super) fn new(file: File) -> Self {
-        Self { file, hasher: sha2::Sha256::new(), slice: Vec::new() }
+        Self { file, hashed: HashingWriter::new(sink()), slice: Vec::new() }
     }
 
     /// Reads the next slice. Gives its bytes, 0 at the end of the file.
@@ -102,7 +101,7 @@ impl Hashing {
         on_files(move || {
             self.slice.resize(SLICE, 0);
             let count = self.file.read(&mut self.slice).map_err(unreadable())?;
-            self.hasher.update(&self.slice[..count]);
+            self.hashed.write_all(&self.slice[..count]).map_err(unreadable())?;
             Ok((self, count))
         })
         .await
@@ -110,7 +109,7 @@ impl Hashing {
 
     /// The hash of all slices that were read.
     pub(super) fn finish(self) -> Sha256 {
-        Sha256::new(self.hasher.finalize().into())
+        self.hashed.sha256()
     }
 }
 

@@ -156,10 +156,9 @@ impl Store {
             );
         }
         let mut after = None;
-        loop {
-            let page = records::page(&mut *self.readers.acquire().await?, after.as_ref()).await?;
-            let Some(last) = page.last() else { break };
-            after = Some(last.place.clone());
+        while let Some(page) =
+            records::next_page(&mut *self.readers.acquire().await?, &mut after).await?
+        {
             for record in page {
                 let path = record.path(self.dir());
                 let found = on_files(move || {

@@ -64,12 +64,12 @@ pub use rows::{Expired, Filter, Page, Span};
 pub use staging::{BlobWriter, StagedBlob, StagedDir, StagedPath};
 pub use submit::{NewJob, NewRequest};
 pub use tables::{
-    Asked, Blob, BlobRow, Calibration, Change, Changes, Claimant, Delivery, Entitlement,
-    FIRST_RESERVE, FailedTask, FailureCause, FoundPartial, Inserted, Job, JobChanges, JobFilter,
-    LabFigures, LabRow, LabUse, Made, Measurement, Model, NewCalibration, NewMeasurement, NewModel,
-    NewPartial, Notification, Origin, Partial, PartialFile, Request, RequestKey, Reservations,
-    Resource, TaskCounts, TaskRecord, TaskTotals, Thing, TileHistory, TileResult, TileState, Token,
-    WorkerPlace, WorkerRow, WorkerTask, share_error,
+    Blob, BlobRow, Calibration, Change, Changes, Claimant, Delivery, Entitlement, FIRST_RESERVE,
+    FailedTask, FailureCause, FoundPartial, FoundResource, Inserted, Job, JobChanges, JobFilter,
+    LabFigures, LabRow, LabUse, Measurement, Model, NewCalibration, NewMeasurement, NewModel,
+    NewPartial, Notification, Origin, Partial, PartialFile, ReadyResource, Request, RequestKey,
+    Reservations, Resource, ResourceKind, TaskCounts, TaskRecord, TaskTotals, TileHistory,
+    TileResult, TileState, Token, WorkerPlace, WorkerRow, WorkerTask, share_error,
 };
 pub use watch::Watcher;
 

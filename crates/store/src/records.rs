@@ -65,6 +65,16 @@ impl Record {
     }
 }
 
+/// The next page of records, after whose last one `after` stands then. `None` at the end.
+pub(super) async fn next_page(
+    connection: &mut SqliteConnection,
+    after: &mut Option<Place>,
+) -> Result<Option<Vec<Record>>> {
+    let page = page(connection, after.as_ref()).await?;
+    *after = page.last().map(|last| last.place.clone());
+    Ok(after.is_some().then_some(page))
+}
+
 /// The records after this place, or the first ones; none at the end.
 pub(super) async fn page(
     connection: &mut SqliteConnection,

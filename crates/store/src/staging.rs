@@ -7,7 +7,6 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use sha2::Digest;
 use uuid::Uuid;
 
 use super::Store;
@@ -15,7 +14,7 @@ use super::error::{Result, StoreError};
 use super::hashes::{Identity, digest};
 use super::locked::LockedFile;
 use super::{DataDir, dir, on_files, upgrade};
-use engine::job::{Sha256, Timestamp, WrittenFile};
+use engine::job::{HashingWriter, Sha256, Timestamp, WrittenFile};
 
 /// A temporary file or folder; its lock and its removal.
 #[derive(Debug)]
@@ -54,8 +53,8 @@ impl Store {
         let path = &staged.0.path;
         let file = File::options().write(true).open(path);
         let file = file.map_err(StoreError::io("open", path))?;
-        let file = BufWriter::with_capacity(256 * 1024, file);
-        Ok(BlobWriter { file, temporary: staged.0, hasher: sha2::Sha256::new(), size: 0 })
+        let file = HashingWriter::new(BufWriter::with_capacity(256 * 1024, file));
+        Ok(BlobWriter { file, temporary: staged.0 })
     }
 
     /// A new empty file for a writer that wants a path. Blocks on the disk.
@@ -124,31 +123,26 @@ fn keep(root: &DataDir, place: &Path, since: Option<Timestamp>) -> Result<bool> 
 #[derive(Debug)]
 pub struct BlobWriter {
     temporary: Temporary,
-    file: BufWriter<File>,
-    hasher: sha2::Sha256,
-    size: u64,
+    file: HashingWriter<BufWriter<File>>,
 }
 
 impl BlobWriter {
     pub fn size(&self) -> u64 {
-        self.size
+        self.file.size()
     }
 
     /// Brings the file to the disk.
     pub fn finish(mut self) -> Result<StagedBlob> {
-        let synced = self.file.flush().and_then(|()| self.file.get_ref().sync_all());
+        let synced = self.file.flush().and_then(|()| self.file.writer.get_ref().sync_all());
         synced.map_err(StoreError::io("write to the disk", &self.temporary.path))?;
-        let sha256 = Sha256::new(self.hasher.finalize().into());
-        Ok(StagedBlob { temporary: self.temporary, sha256, size: self.size })
+        let (sha256, size) = (self.file.sha256(), self.file.size());
+        Ok(StagedBlob { temporary: self.temporary, sha256, size })
     }
 }
 
 impl Write for BlobWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let count = self.file.write(bytes)?;
-        self.hasher.update(&bytes[..count]);
-        self.size += count as u64;
-        Ok(count)
+        self.file.write(bytes)
     }
 
     fn flush(&mut self) -> io::Result<()> {

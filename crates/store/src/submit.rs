@@ -6,10 +6,10 @@ use super::Store;
 use super::error::Result;
 use super::queue::graph;
 use super::rows::{Reference, require};
-use super::tables::keys::{self, Inserted, Made, RequestKey};
+use super::tables::keys::{self, Inserted, RequestKey, ResourceKind};
 use super::tables::{jobs, quota, requests};
 use engine::job::{
-    CheckLimits, InvalidId, JobId, JobSpec, Lab, Submission, TaskKind, ThingId, TokenId,
+    CheckLimits, InvalidId, JobId, JobSpec, Lab, ResourceId, Submission, TaskKind, TokenId,
 };
 
 #[derive(Debug, Clone)]
@@ -42,9 +42,9 @@ impl Store {
         key: Option<&RequestKey>,
     ) -> Result<Inserted<Id>>
     where
-        Id: From<ThingId> + FromStr<Err = InvalidId>,
+        Id: From<ResourceId> + FromStr<Err = InvalidId>,
     {
-        let (what, id) = (Made::of(submission), ThingId::new());
+        let (what, id) = (ResourceKind::of(submission), ResourceId::new());
         let mut transaction = self.write().await?;
         if let Some(before) = keys::found(&mut transaction, lab, what, key).await? {
             return Ok(Inserted::Before(before));
@@ -66,7 +66,9 @@ impl Store {
     pub async fn add_job(&self, new: NewJob) -> Result<Inserted> {
         let mut transaction = self.write().await?;
         let key = new.key.as_ref();
-        if let Some(before) = keys::found(&mut transaction, &new.lab, Made::Job, key).await? {
+        if let Some(before) =
+            keys::found(&mut transaction, &new.lab, ResourceKind::Job, key).await?
+        {
             return Ok(Inserted::Before(before));
         }
         quota::check_jobs(&mut transaction, &new.lab, new.most_jobs).await?;
@@ -77,7 +79,7 @@ impl Store {
         let id = JobId::new();
         jobs::insert(&mut transaction, id, &new.lab, &new.spec).await?;
         graph::insert(&mut transaction, &new.lab, id, &new.spec).await?;
-        keys::insert(&mut transaction, &new.lab, Made::Job, key, id).await?;
+        keys::insert(&mut transaction, &new.lab, ResourceKind::Job, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }

@@ -27,12 +27,22 @@ use super::{
 };
 use engine::job::{
     Algorithm, CalibrationRequest, CheckLimits, InvalidId, JobId, JobRequest, JobState,
-    MeasurementId, MeasurementRequest, Reading, ResultFile, ScaleBasis, Sequence, Sha256,
-    SnapshotSelection, Submission, TaskKind, TaskProgress, ThingId, TileSpec, WorkerId,
-    WrittenFile,
+    MeasurementId, MeasurementRequest, Reading, ResourceId, ResultFile, ScaleBasis, Sequence,
+    Sha256, SnapshotSelection, Submission, TaskKind, TaskProgress, TileSpec, WorkerId, WrittenFile,
 };
 
 const LEASE: Duration = Duration::from_secs(60);
+
+impl Store {
+    /// Hands out the next task to a worker of this machine that takes all kinds.
+    async fn claim(
+        &self,
+        worker: WorkerId,
+        length: Duration,
+    ) -> Result<Option<ClaimedTask>, StoreError> {
+        self.claim_as(Claimant::Local, worker, length).await
+    }
+}
 
 impl ClaimedTask {
     /// The step of a job.
@@ -108,7 +118,12 @@ impl Lab {
             sequence: Sequence::Separate,
             dark: Vec::new(),
             warnings: Vec::new(),
-            reading: Reading::whole(ScaleBasis::Type),
+            reading: Reading {
+                scale_basis: ScaleBasis::Type,
+                crop: None,
+                frames: None,
+                packing: None,
+            },
         };
         let asked = MeasurementRequest::new(None, calibration, data.sha256);
         let passed = Checked::Measurement(Box::new(facts), upload(b"prepared data"));
@@ -121,7 +136,7 @@ impl Lab {
     /// Makes something of uploads, whose check ends like this.
     async fn make<Id>(&self, asked: Submission, passed: Checked) -> Id
     where
-        Id: From<ThingId> + FromStr<Err = InvalidId>,
+        Id: From<ResourceId> + FromStr<Err = InvalidId>,
     {
         make(&self.store, self.worker, asked, passed).await
     }
@@ -291,7 +306,7 @@ fn new_request(submission: Submission) -> NewRequest {
 /// Requests something, and does its check with this outcome.
 async fn make<Id>(store: &Store, worker: WorkerId, asked: Submission, passed: Checked) -> Id
 where
-    Id: From<ThingId> + FromStr<Err = InvalidId>,
+    Id: From<ResourceId> + FromStr<Err = InvalidId>,
 {
     let local = engine::job::Lab::local();
     let is_model = matches!(asked, Submission::Model(_));

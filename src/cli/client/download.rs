@@ -1,7 +1,7 @@
 //! Downloads a file, and resumes after an interruption. Existing files are not overwritten.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{ErrorKind, Read, Seek, Write};
+use std::io::{BufReader, ErrorKind, Read, Seek, Sink, Write, copy, sink};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -9,11 +9,10 @@ use futures_util::StreamExt;
 use indicatif::ProgressBar;
 use reqwest::{Method, StatusCode};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
-use sha2::Digest;
 
 use super::{Client, Result, refusal, wait_to_retry};
 use crate::cli::CliError;
-use engine::job::Sha256;
+use engine::job::{HashingWriter, Sha256};
 use store::LockedFile;
 
 /// Time between requests for a file that the service is still making.
@@ -65,18 +64,18 @@ impl Client {
         }
         // Another process may have downloaded the beginning. The ETag in the name identifies the file's content.
         let part = self.bytes(href, &etag, (part(path, &etag), size), bar).await?;
-        if let Some(expected) = sha256.filter(|expected| *expected != part.sha256()) {
+        if let Some(expected) = sha256.filter(|expected| *expected != part.hashed.sha256()) {
             let text = format!(
                 "{}: the downloaded file has the hash {}, not {expected}",
                 path.display(),
-                part.sha256()
+                part.hashed.sha256()
             );
             // A damaged download can't be resumed.
             part.remove();
             return Err(CliError::Failure(text).into());
         }
         if exists {
-            let is_same = has(path, part.sha256());
+            let is_same = has(path, part.hashed.sha256());
             part.remove();
             return if is_same { Ok(Fetched::Existing) } else { Err(name_in_use(path).into()) };
         }
@@ -95,13 +94,13 @@ impl Client {
         let mut part = Part::open(path, size)?;
         let mut attempt = 0;
         loop {
-            bar.set_position(part.length);
-            if part.length == size {
+            bar.set_position(part.length());
+            if part.length() == size {
                 return Ok(part);
             }
             let mut request = self.request(Method::GET, href);
-            if part.length > 0 {
-                let range = format!("bytes={}-", part.length);
+            if part.length() > 0 {
+                let range = format!("bytes={}-", part.length());
                 request = request.header("Range", range).header("If-Range", etag);
             }
             let answer = match request.send().await {
@@ -151,9 +150,8 @@ const RECORD_BYTES: u64 = 1 << 20;
 struct Part {
     file: LockedFile,
     path: PathBuf,
-    hasher: sha2::Sha256,
-    /// Number of bytes in the file.
-    length: u64,
+    /// Hash and number of the bytes in the file.
+    hashed: HashingWriter<Sink>,
     /// Number of bytes in the record.
     recorded: u64,
 }
@@ -174,7 +172,7 @@ impl Part {
         // Two processes would append to the same file.
         let file = LockedFile::take(file.map_err(unwritable)?)
             .map_err(|error| CliError::file("lock", &path, &error))?;
-        let mut part = Self { file, path, hasher: sha2::Sha256::new(), length: 0, recorded: 0 };
+        let mut part = Self { file, path, hashed: HashingWriter::new(sink()), recorded: 0 };
         match part.resume(size) {
             Ok(true) => Ok(part),
             Ok(false) => part.clear().map(|()| part),
@@ -192,45 +190,38 @@ impl Part {
         if length > size || length > self.file.metadata()?.len() {
             return Ok(false);
         }
-        let mut beginning = (&mut *self.file).take(length);
-        let mut buffer = vec![0; 256 * 1024];
-        loop {
-            match beginning.read(&mut buffer)? {
-                0 => break,
-                count => self.hasher.update(&buffer[..count]),
-            }
-        }
-        if self.sha256() != sha256 {
+        let beginning = (&mut *self.file).take(length);
+        copy(&mut BufReader::with_capacity(256 * 1024, beginning), &mut self.hashed)?;
+        if (self.hashed.sha256(), self.hashed.size()) != (sha256, length) {
             return Ok(false);
         }
-        (self.length, self.recorded) = (length, length);
+        self.recorded = length;
         self.file.set_len(length)?;
         Ok(true)
     }
 
     fn clear(&mut self) -> Result<(), CliError> {
-        (self.hasher, self.length, self.recorded) = (sha2::Sha256::new(), 0, 0);
+        (self.hashed, self.recorded) = (HashingWriter::new(sink()), 0);
         let cleared = self.file.set_len(0).and_then(|()| self.file.rewind());
         cleared.map_err(|error| self.unwritable(&error))
     }
 
     fn append(&mut self, piece: &[u8]) -> Result<(), CliError> {
-        self.file.write_all(piece).map_err(|error| self.unwritable(&error))?;
-        self.hasher.update(piece);
-        self.length += piece.len() as u64;
-        if self.length >= self.recorded + RECORD_BYTES { self.record() } else { Ok(()) }
+        let written = self.file.write_all(piece).and_then(|()| self.hashed.write_all(piece));
+        written.map_err(|error| self.unwritable(&error))?;
+        if self.length() >= self.recorded + RECORD_BYTES { self.record() } else { Ok(()) }
     }
 
-    /// Hash of the bytes in the file.
-    fn sha256(&self) -> Sha256 {
-        Sha256::new(self.hasher.clone().finalize().into())
+    /// Number of bytes in the file.
+    fn length(&self) -> u64 {
+        self.hashed.size()
     }
 
     /// Writes the record. A torn record agrees with no file, so the download starts again.
     fn record(&mut self) -> Result<(), CliError> {
-        self.recorded = self.length;
+        self.recorded = self.length();
         let path = self.record_path();
-        let written = fs::write(&path, format!("{} {}\n", self.length, self.sha256()));
+        let written = fs::write(&path, format!("{} {}\n", self.recorded, self.hashed.sha256()));
         written.map_err(|error| CliError::file("write", &path, &error))
     }
 

@@ -3,12 +3,13 @@
 use std::fs;
 use std::path::Path;
 
-use maud::{DOCTYPE, Markup, html};
+use maud::html;
 use ndarray::{Array3, Axis};
 
 use super::report::{PAGE, Report};
 use crate::cli::CliError;
 use crate::cli::error::Result;
+use engine::intake::html_page;
 use formats::display::{Encoding, Picture};
 use formats::{Channels, Limits, read_stack};
 
@@ -64,7 +65,7 @@ pub(super) fn write(
         let difference = picture(&format!("{name}-difference"), difference.view(), 1.0 / GAIN)?;
         pictures.push((name, picture(name, frame, 1.0)?, Some(difference)));
     }
-    let text = page((middle, &measured), &pictures, reconstructions, report).into_string();
+    let text = page((middle, &measured), &pictures, reconstructions, report);
     let path = out.join(PAGE);
     fs::write(&path, text).map_err(|error| unwritable(&path, error))
 }
@@ -77,53 +78,44 @@ fn page(
     pictures: &[Shown<'_>],
     reconstructions: &[Reconstruction],
     report: &Report,
-) -> Markup {
-    html! {
-        (DOCTYPE)
-        html lang="en" {
-            head {
-                meta charset="utf-8";
-                meta name="viewport" content="width=device-width, initial-scale=1";
-                title { "sci-recon: the demo" }
-                style { (STYLE) }
-            }
-            body {
-                h1 { "One snapshot, " (report.frames) " frames" }
-                div class="row" {
-                    figure { img src=(measured) alt="The measurement"; figcaption { "the measurement" } }
-                    @for Reconstruction { name, movie, .. } in reconstructions {
-                        figure {
-                            video src=(movie) controls loop autoplay muted playsinline {}
-                            figcaption { (name) }
-                        }
-                    }
-                }
-                table {
-                    tr { th { "" } th { "PSNR" } th { "SSIM" } th { "CPU" } }
-                    @for (name, quality) in report.rows() {
-                        tr {
-                            td { (name) }
-                            td { (format!("{:.2} dB", quality.psnr_db)) }
-                            td { (format!("{:.4}", quality.ssim)) }
-                            td { (format!("{:.1} s", quality.cpu_seconds)) }
-                        }
-                    }
-                }
-                h2 { "Frame " (middle + 1) }
-                div class="row" {
-                    @for (name, picture, _) in pictures {
-                    figure { img src=(picture) alt=(name); figcaption { (name) } }
-                    }
-                }
-                h2 { "Difference from the truth, " (GAIN) " times as bright" }
-                div class="row" {
-                    @for (name, _, difference) in pictures {
-                        @if let Some(difference) = difference {
-                            figure { img src=(difference) alt={ "Difference of " (name) }; figcaption { (name) } }
-                        }
-                    }
+) -> String {
+    let style = html! { style { (STYLE) } };
+    let body = html! {
+        h1 { "One snapshot, " (report.frames) " frames" }
+        div class="row" {
+            figure { img src=(measured) alt="The measurement"; figcaption { "the measurement" } }
+            @for Reconstruction { name, movie, .. } in reconstructions {
+                figure {
+                    video src=(movie) controls loop autoplay muted playsinline {}
+                    figcaption { (name) }
                 }
             }
         }
-    }
+        table {
+            tr { th { "" } th { "PSNR" } th { "SSIM" } th { "CPU" } }
+            @for (name, quality) in report.rows() {
+                tr {
+                    td { (name) }
+                    td { (format!("{:.2} dB", quality.psnr_db)) }
+                    td { (format!("{:.4}", quality.ssim)) }
+                    td { (format!("{:.1} s", quality.cpu_seconds)) }
+                }
+            }
+        }
+        h2 { "Frame " (middle + 1) }
+        div class="row" {
+            @for (name, picture, _) in pictures {
+            figure { img src=(picture) alt=(name); figcaption { (name) } }
+            }
+        }
+        h2 { "Difference from the truth, " (GAIN) " times as bright" }
+        div class="row" {
+            @for (name, _, difference) in pictures {
+                @if let Some(difference) = difference {
+                    figure { img src=(difference) alt={ "Difference of " (name) }; figcaption { (name) } }
+                }
+            }
+        }
+    };
+    html_page("sci-recon: the demo", &style, &body)
 }

@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use crate::cli::CliError;
 use crate::cli::error::Result;
+use engine::job::Captures;
 use formats::npy;
 use optics::{Camera, generator, measure};
 
@@ -18,16 +19,8 @@ const BACKGROUND_THROUGH_MASK: f64 = 0.5;
 #[derive(Debug, Serialize)]
 struct Index {
     schema: &'static str,
-    /// For each pattern, the files with captures of the white board through the mask.
-    masks: Vec<Vec<String>>,
-    /// Captures through the mask with the LCoS all black.
-    black_with_mask: Vec<String>,
-    /// Captures without the mask, with the LCoS all white.
-    white: Vec<String>,
-    /// Captures without the mask, with the LCoS all black.
-    black: Vec<String>,
-    /// The number of a saturated pixel.
-    saturation: u16,
+    #[serde(flatten)]
+    captures: Captures<String>,
     measurement: Measurement,
 }
 
@@ -80,11 +73,18 @@ impl Lab<'_> {
         let white = &self.illumination * exposure;
         let index = Index {
             schema: "sci-recon/captures/1",
-            masks,
-            black_with_mask: vec![shots.take("black_with_mask.npy", &closed, masked_background)?],
-            white: vec![shots.take("white.npy", &white, camera.background)?],
-            black: vec![shots.take("black.npy", &closed, camera.background)?],
-            saturation: camera.saturation(),
+            captures: Captures {
+                masks,
+                white: vec![shots.take("white.npy", &white, camera.background)?],
+                black: vec![shots.take("black.npy", &closed, camera.background)?],
+                black_with_mask: vec![shots.take(
+                    "black_with_mask.npy",
+                    &closed,
+                    masked_background,
+                )?],
+                patterns: None,
+                saturation: Some(camera.saturation().into()),
+            },
             measurement: Measurement {
                 dark: vec![shots.take("scene_black.npy", &closed, masked_background)?],
                 data: self.snapshots(&mut shots, snapshots, scene, masked_background)?,

@@ -86,7 +86,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let excluded = arguments
             .submission
             .own_files()
-            .map(|file| file.canonicalize().map_err(|error| CliError::file("read", file, &error)));
+            .map(|file| file.canonicalize().map_err(|error| CliError::unreadable(file, &error)));
         let mut watch = Watch {
             arguments,
             client,

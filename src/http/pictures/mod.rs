@@ -6,12 +6,12 @@ mod source;
 
 use std::sync::Arc;
 
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use names::Named;
-pub(super) use names::{OfBlob, OfCalibration, OfJob, OfMeasurement};
+pub(super) use names::{Of, OfJob};
 
 use super::app::App;
 use super::conditional;
@@ -137,9 +137,8 @@ pub(super) async fn values<N: Named>(
         format!("values/1 {} {region:?}", picture.identity).as_bytes(),
     ));
     let tags = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, "private, no-cache".into())];
-    conditional::check_match(&headers, &etag)?;
-    if conditional::is_known(&headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
+    if let Some(known) = conditional::not_modified(&headers, &etag, tags.clone())? {
+        return Ok(known);
     }
     let values = app.pictures.reduced(Arc::new(picture), region).await?;
     let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
@@ -185,9 +184,8 @@ async fn draw(
         (header::CACHE_CONTROL, "private, no-cache".into()),
         (header::VARY, "accept".into()),
     ];
-    conditional::check_match(headers, &etag)?;
-    if conditional::is_known(headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, tags).into_response());
+    if let Some(known) = conditional::not_modified(headers, &etag, tags.clone())? {
+        return Ok(known);
     }
     let channels = picture.channels;
     let values = app.pictures.reduced(Arc::new(picture), region).await?;

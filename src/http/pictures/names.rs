@@ -65,21 +65,11 @@ pub(in crate::http) struct OfJob {
     picture: String,
 }
 
+/// A picture of an uploaded file, a measurement or a calibration.
 #[derive(Debug, Deserialize)]
-pub(in crate::http) struct OfBlob {
-    sha256: Sha256,
-    picture: String,
-}
-
-#[derive(Debug, Deserialize)]
-pub(in crate::http) struct OfMeasurement {
-    measurement: MeasurementId,
-    picture: String,
-}
-
-#[derive(Debug, Deserialize)]
-pub(in crate::http) struct OfCalibration {
-    calibration: CalibrationId,
+pub(in crate::http) struct Of<Id> {
+    #[serde(alias = "sha256", alias = "measurement", alias = "calibration")]
+    id: Id,
     picture: String,
 }
 
@@ -131,9 +121,9 @@ impl Named for OfJob {
     }
 }
 
-impl Named for OfBlob {
+impl Named for Of<Sha256> {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
-        let Self { sha256, picture } = self;
+        let Self { id: sha256, picture } = self;
         let (frame, name) = match (picture.strip_prefix("array-"), parts(&picture)) {
             (Some(name), _) => (1, Some(name.to_owned())),
             (None, ("frame", Some(frame))) => (frame, None),
@@ -165,12 +155,12 @@ impl Named for OfBlob {
     }
 }
 
-impl Named for OfMeasurement {
+impl Named for Of<MeasurementId> {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let ("snapshot", Some(snapshot)) = parts(&self.picture) else {
             return Err(not_found(OF_MEASUREMENT.into()));
         };
-        let measurement = app.store.measurement(lab, self.measurement).await?;
+        let measurement = app.store.measurement(lab, self.id).await?;
         let stack = snapshots_stack(app, &measurement).await?;
         let count = stack.shape.0;
         if snapshot < count {
@@ -180,13 +170,13 @@ impl Named for OfMeasurement {
     }
 }
 
-impl Named for OfCalibration {
+impl Named for Of<CalibrationId> {
     async fn find(self, app: &App, lab: &Lab) -> Result<Picture> {
         let picture = parts(&self.picture);
         if !matches!(picture, ("mask", Some(_)) | ("mean" | "gram" | "dead", None)) {
             return Err(not_found(OF_CALIBRATION.into()));
         }
-        let calibration = app.store.calibration(lab, self.calibration).await?;
+        let calibration = app.store.calibration(lab, self.id).await?;
         let stack = masks_stack(app, &calibration).await?;
         let count = stack.shape.0;
         match picture {

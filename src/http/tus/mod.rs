@@ -22,7 +22,7 @@ use super::extract::{Caller, Params, QueryOf, check_encoding, content_digest, re
 use super::listen::Cut;
 use super::page::{Cursor, PageBody, PageQuery};
 use engine::job::{Lab, PartialId, Sha256, Timestamp};
-use store::{FIRST_RESERVE, FoundPartial, Made, NewPartial, Partial, PartialFile};
+use store::{FIRST_RESERVE, FoundPartial, NewPartial, Partial, PartialFile, ResourceKind};
 
 const RESUMABLE: HeaderName = HeaderName::from_static("tus-resumable");
 const LENGTH: HeaderName = HeaderName::from_static("upload-length");
@@ -137,7 +137,9 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
     let metadata = text(&headers, &METADATA)?.unwrap_or_default();
     let expected = expected_sha256(metadata).map_err(malformed)?;
     let key = request_key(&headers, &(length, metadata))?;
-    if let Some(id) = app.store.made_with(&access.lab, Made::Upload, key.as_ref()).await? {
+    if let Some(id) =
+        app.store.created_with(&access.lab, ResourceKind::Upload, key.as_ref()).await?
+    {
         return created(&app, &access.lab, id).await;
     }
     app.admission.check_length(&access, length.unwrap_or(1)).await?;
@@ -234,7 +236,7 @@ pub(super) async fn patch(
     request: RequestContext,
     body: Body,
 ) -> Result<Response> {
-    drop(request.precondition(&app.changes, &access.lab, current(&app, &access.lab, id)).await?);
+    drop(app.precondition(&request, &access.lab, current(&app, &access.lab, id)).await?);
     let permit = app.admission.place(&access.lab)?;
     let upload = run_detached(async move {
         let _permit = permit;
@@ -340,8 +342,7 @@ pub(super) async fn delete(
     Params(id): Params<PartialId>,
     request: RequestContext,
 ) -> Result<StatusCode> {
-    let _guard =
-        request.precondition(&app.changes, &access.lab, current(&app, &access.lab, id)).await?;
+    let _guard = app.precondition(&request, &access.lab, current(&app, &access.lab, id)).await?;
     app.store.partial(&access.lab, id).await?;
     let store = app.store.clone();
     let deleted = run_detached(async move { Ok(store.delete_partial(id).await?) });

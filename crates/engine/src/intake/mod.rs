@@ -26,7 +26,7 @@ pub use read::{
     Scaled, Snapshots, read_clip, read_colours, read_masks, read_snapshots, read_truth,
 };
 pub use refusal::{Refusal, RefusalCode};
-pub use report_page::report_page;
+pub use report_page::{html_page, report_page};
 pub use sample::{Sample, sample};
 pub use sizes::size_remedy;
 pub use spectral::expected_size;

@@ -12,37 +12,45 @@ const CELL: usize = 16;
 /// Renders a report; `title` names the calibration. The page refers to pictures in `maps/` and to the style sheet of
 /// the service. It is readable without the style sheet.
 pub fn report_page(title: &str, report: &CalibrationReport) -> String {
+    let title = format!("Calibration {title}");
+    let style = html! { link rel="stylesheet" href="../../../dashboard/style.css"; };
+    let body = html! {
+        main {
+            h1 { (title) }
+            @if let Some(job) = &report.registration_of {
+                p { "The registration of job " code { (job) } " has corrected these masks." }
+            }
+            (grade(report))
+            h2 { "Masks" }
+            (masks(&report.masks, report))
+            @if let Some(captures) = &report.captures {
+                h2 { "Captures" }
+                (captured(captures))
+                (patterns(captures))
+            }
+            h2 { "Correlation between the masks" }
+            (correlation(&report.masks))
+            @for map in &report.maps {
+                h2 { (caption(map)) }
+                p { img src={ "maps/" (map) ".png" } alt=(caption(map)); }
+            }
+        }
+    };
+    html_page(&title, &style, &body)
+}
+
+/// A page with a title, the element of its style, and the content of its body.
+pub fn html_page(title: &str, style: &Markup, body: &Markup) -> String {
     let page = html! {
         (DOCTYPE)
         html lang="en" {
             head {
                 meta charset="utf-8";
                 meta name="viewport" content="width=device-width, initial-scale=1";
-                title { "Calibration " (title) }
-                link rel="stylesheet" href="../../../dashboard/style.css";
+                title { (title) }
+                (style)
             }
-            body {
-                main {
-                    h1 { "Calibration " (title) }
-                    @if let Some(job) = &report.registration_of {
-                        p { "The registration of job " code { (job) } " has corrected these masks." }
-                    }
-                    (grade(report))
-                    h2 { "Masks" }
-                    (masks(&report.masks, report))
-                    @if let Some(captures) = &report.captures {
-                        h2 { "Captures" }
-                        (captured(captures))
-                        (patterns(captures))
-                    }
-                    h2 { "Correlation between the masks" }
-                    (correlation(&report.masks))
-                    @for map in &report.maps {
-                        h2 { (caption(map)) }
-                        p { img src={ "maps/" (map) ".png" } alt=(caption(map)); }
-                    }
-                }
-            }
+            body { (body) }
         }
     };
     page.into_string()

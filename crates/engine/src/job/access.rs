@@ -47,7 +47,7 @@ pub enum Role {
     Read,
     /// Upload data, submit and cancel jobs, delete.
     Submit,
-    /// View the metrics of the whole service.
+    /// View metrics and the state of the service, and give jobs a priority above 0.
     Admin,
 }
 

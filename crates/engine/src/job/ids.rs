@@ -53,28 +53,28 @@ macro_rules! identifiers {
     )*};
 }
 
-/// Converts the identifiers of things to and from [`ThingId`].
-macro_rules! things {
+/// Converts the identifiers of resources to and from [`ResourceId`].
+macro_rules! resource_ids {
     ($($name:ident),*) => {$(
-        impl From<$name> for ThingId {
+        impl From<$name> for ResourceId {
             fn from(id: $name) -> Self {
                 Self(id.0)
             }
         }
 
-        impl From<ThingId> for $name {
-            fn from(id: ThingId) -> Self {
+        impl From<ResourceId> for $name {
+            fn from(id: ResourceId) -> Self {
                 Self(id.0)
             }
         }
     )*};
 }
 
-things!(CalibrationId, MeasurementId, ModelId, JobId);
+resource_ids!(CalibrationId, MeasurementId, ModelId, JobId);
 
 identifiers! {
     /// The calibration, measurement, model or job that a task creates, or for which it creates something.
-    ThingId,
+    ResourceId,
     /// A calibration: the masks of one optical setting.
     CalibrationId,
     /// A measurement: one or more snapshots taken with one calibration.

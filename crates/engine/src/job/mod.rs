@@ -26,8 +26,8 @@ pub use algorithm::Algorithm;
 pub use assessment::{Assessment, MaskOrder};
 pub use captures::{Captures, MAX_CALIBRATION_SECONDS, MAX_MASKS, planned_seconds};
 pub use ids::{
-    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, TaskId, ThingId, TokenId,
-    WorkerId,
+    CalibrationId, InvalidId, JobId, MeasurementId, ModelId, PartialId, ResourceId, TaskId,
+    TokenId, WorkerId,
 };
 pub use inputs::{CorrectedMasks, Inputs, MaskInputs, MeasurementInputs, fields};
 pub use model::{
@@ -53,5 +53,7 @@ pub use task::{
     MIN_MOVIE_SIDE, MOVIE_SIDE, MovieFormat, ResultFile, TaskKind, TaskProgress, TaskStage,
     TaskState, WrittenFile, movie_step,
 };
-pub use text::{InvalidField, InvalidText, Label, Sha256, Timestamp, with_causes, without_paths};
+pub use text::{
+    HashingWriter, InvalidField, InvalidText, Label, Sha256, Timestamp, with_causes, without_paths,
+};
 pub use webhook::Webhook;

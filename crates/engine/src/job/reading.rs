@@ -28,13 +28,6 @@ pub struct Reading {
     pub packing: Option<Packing>,
 }
 
-impl Reading {
-    /// A whole file with one number per pixel.
-    pub fn whole(scale_basis: ScaleBasis) -> Self {
-        Self { scale_basis, crop: None, frames: None, packing: None }
-    }
-}
-
 /// True if a window starts at the first pixel of a cell of 2x2 pixels.
 pub fn keeps_mosaic(crop: Option<Crop>) -> bool {
     crop.is_none_or(|crop| crop.row.is_multiple_of(2) && crop.column.is_multiple_of(2))

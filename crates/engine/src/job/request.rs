@@ -32,7 +32,10 @@ const SNAPSHOT_BYTES: u64 = 1 << 20;
 
 /// The snapshots of a request: `"all"`, one index, or `[first, last]` with both ends included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case", try_from = "SelectionJson")]
+#[serde(
+    rename_all = "snake_case",
+    expecting = "snapshots must be \"all\", one index, or [first, last] with both ends included"
+)]
 pub enum SnapshotSelection {
     #[default]
     All,
@@ -56,32 +59,6 @@ text_schema!(SnapshotSelection, "Selection", {
         },
     ],
 });
-
-#[derive(Deserialize)]
-#[serde(
-    untagged,
-    expecting = "snapshots must be \"all\", one index, or [first, last] with both ends included"
-)]
-enum SelectionJson {
-    Word(String),
-    One(u32),
-    Range([u32; 2]),
-}
-
-impl TryFrom<SelectionJson> for SnapshotSelection {
-    type Error = &'static str;
-
-    fn try_from(json: SelectionJson) -> Result<Self, &'static str> {
-        match json {
-            SelectionJson::Word(word) if word == "all" => Ok(Self::All),
-            SelectionJson::Word(_) => Err(
-                "snapshots must be \"all\", one index, or [first, last] with both ends included",
-            ),
-            SelectionJson::One(index) => Ok(Self::One(index)),
-            SelectionJson::Range([first, last]) => Ok(Self::Range(first, last)),
-        }
-    }
-}
 
 /// The body of `POST /v1/jobs`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]

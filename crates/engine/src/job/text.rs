@@ -1,7 +1,7 @@
 //! Validated text values: labels, hashes and times, and the errors of invalid ones.
 
 use std::fmt;
-use std::io::{self, BufRead, BufReader, Read};
+use std::io::{self, BufReader, Read, Write};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -141,31 +141,54 @@ impl Sha256 {
 
     /// Hashes all remaining bytes of a reader, and counts them.
     pub fn of_reader(reader: &mut impl Read) -> io::Result<(Self, u64)> {
-        use sha2::Digest;
-        let mut hasher = sha2::Sha256::new();
-        let mut reader = BufReader::with_capacity(256 * 1024, reader);
-        let mut size = 0;
-        loop {
-            let length = match reader.fill_buf() {
-                Ok(bytes) => {
-                    hasher.update(bytes);
-                    bytes.len()
-                }
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-                Err(error) => return Err(error),
-            };
-            if length == 0 {
-                return Ok((Self(hasher.finalize().into()), size));
-            }
-            reader.consume(length);
-            size += length as u64;
-        }
+        let mut hashed = HashingWriter::new(io::sink());
+        let size = io::copy(&mut BufReader::with_capacity(256 * 1024, reader), &mut hashed)?;
+        Ok((hashed.sha256(), size))
     }
 
     /// The hash of these bytes.
     pub fn of(bytes: &[u8]) -> Self {
         use sha2::Digest;
         Self(sha2::Sha256::digest(bytes).into())
+    }
+}
+
+/// Hashes and counts the bytes that it passes to a writer.
+#[derive(Debug)]
+pub struct HashingWriter<W> {
+    pub writer: W,
+    hasher: sha2::Sha256,
+    size: u64,
+}
+
+impl<W> HashingWriter<W> {
+    pub fn new(writer: W) -> Self {
+        Self { writer, hasher: sha2::Sha256::default(), size: 0 }
+    }
+
+    /// Number of bytes so far.
+    pub fn size(&self) -> u64 {
+        self.size
+    }
+
+    /// Hash of the bytes so far.
+    pub fn sha256(&self) -> Sha256 {
+        use sha2::Digest;
+        Sha256(self.hasher.clone().finalize().into())
+    }
+}
+
+impl<W: Write> Write for HashingWriter<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        use sha2::Digest;
+        let count = self.writer.write(bytes)?;
+        self.hasher.update(&bytes[..count]);
+        self.size += count as u64;
+        Ok(count)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.writer.flush()
     }
 }
 

@@ -29,7 +29,7 @@ pub(super) const SCHEMA_FAMILY: &str = "sci-recon/";
 /// Schema name and version of the manifest of a snapshot.
 const SNAPSHOT_SCHEMA: &str = "sci-recon/snapshot/1";
 /// Schema name and version of the manifest of a job.
-const JOB_SCHEMA: &str = "sci-recon/job/1";
+pub const JOB_SCHEMA: &str = "sci-recon/job/1";
 
 /// The part that the manifests of a job and of its snapshots share.
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]

@@ -13,12 +13,12 @@ use crate::columns::{Columns, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::tables::jobs;
 use crate::tables::requests::{self, Request};
+use crate::tables::resources::{Calibration, Measurement, ReadyResource};
 use crate::tables::tasks::{self, Owner, TaskRecord, TileResult};
-use crate::tables::things::{Calibration, Measurement, Thing};
 use crate::tables::workers::{self, Claimant};
 use engine::job::{
     CalibrationId, Captures, CheckLimits, JobId, JobSpec, JobState, Lab, MovieFormat, Registered,
-    Sha256, Submission, TaskKind, TaskStage, TaskState, ThingId, Timestamp, WorkerId,
+    ResourceId, Sha256, Submission, TaskKind, TaskStage, TaskState, Timestamp, WorkerId,
 };
 use engine::pipeline::derived::STACK;
 
@@ -244,11 +244,6 @@ impl Claimant<'_> {
 }
 
 impl Store {
-    /// Hands out the next task of any kind, if there is one.
-    pub async fn claim(&self, worker: WorkerId, length: Duration) -> Result<Option<ClaimedTask>> {
-        self.claim_as(Claimant::Local, worker, length).await
-    }
-
     /// Hands out the next task that this claimant may have, if there is one.
     pub async fn claim_as(
         &self,
@@ -298,7 +293,7 @@ impl Store {
     pub(super) async fn work(&self, owner: Owner, kind: TaskKind) -> Result<Work, StoreError> {
         match owner {
             Owner::Job(job) => self.job_task(job, kind).await,
-            Owner::Thing(id) => match kind {
+            Owner::Resource(id) => match kind {
                 TaskKind::Check => self.check_task(id).await,
                 TaskKind::Movie { snapshot } => {
                     self.movie_work(id.into(), snapshot, MovieFormat::Mp4).await
@@ -331,8 +326,8 @@ impl Store {
         type Record = Option<Json<Value>>;
         let (Json(spec), prepared, pilot, white): (Json<JobSpec>, Record, Record, Record) =
             facts.fetch_one(&self.readers).await?;
-        let calibration = self.thing_of_any_lab(spec.calibration).await?;
-        let measurement = self.thing_of_any_lab(spec.measurement).await?;
+        let calibration = self.resource_of_any_lab(spec.calibration).await?;
+        let measurement = self.resource_of_any_lab(spec.measurement).await?;
         let (mut tiles, mut records) = (Vec::new(), Vec::new());
         match kind {
             TaskKind::Assemble { snapshot } => tiles = self.tile_results(job, snapshot).await?,
@@ -362,11 +357,8 @@ impl Store {
         format: MovieFormat,
     ) -> Result<Work> {
         let job = self.job_of_any_lab(job).await?;
-        let measurement = self.thing_of_any_lab(job.spec.measurement).await?;
-        let white: Option<Json<Value>> =
-            sql_as!("SELECT record FROM tasks WHERE job = ? AND kind = 'white'", [job.id])
-                .fetch_one(&self.readers)
-                .await?;
+        let measurement = self.resource_of_any_lab(job.spec.measurement).await?;
+        let white = self.white_record(job.id).await?;
         let window = self.movie_window(job.id, format.task(snapshot)).await?;
         let mut clips = Vec::new();
         for snapshot in
@@ -375,13 +367,12 @@ impl Store {
             let (stack, path) = self.result_file(&job, Some(snapshot), STACK).await?;
             clips.push((path, stack.file.sha256));
         }
-        let white = white.map(|json| json.0);
         let (job, spec) = (job.id, job.spec);
         let work = MovieWork { job, spec, format, measurement, white, window, clips };
         Ok(Work::Movie(Box::new(work)))
     }
 
-    async fn check_task(&self, id: ThingId) -> Result<Work> {
+    async fn check_task(&self, id: ResourceId) -> Result<Work> {
         let mut connection = self.readers.acquire().await?;
         let request = requests::find(&mut connection, id).await?;
         let limits = requests::limits(&mut connection, id).await?;
@@ -389,7 +380,7 @@ impl Store {
         let stated = request.submission.calibration();
         let (calibration, registered) = match (request.submission.registration_of(), stated) {
             (Some(job), _) => self.corrected(&request.lab, job).await?.unzip(),
-            (None, Some(id)) => (Some(self.thing_of_any_lab(id).await?), None),
+            (None, Some(id)) => (Some(self.resource_of_any_lab(id).await?), None),
             (None, None) => (None, None),
         };
         let registered = registered.flatten();
@@ -401,10 +392,10 @@ impl Store {
         &self,
         lab: &Lab,
         job: JobId,
-    ) -> Result<Option<(Thing<CalibrationId>, Option<Registered>)>> {
+    ) -> Result<Option<(ReadyResource<CalibrationId>, Option<Registered>)>> {
         let found = async {
             let job = self.job(lab, job).await?;
-            Ok((self.thing_of_any_lab(job.spec.calibration).await?, job.spec.registered))
+            Ok((self.resource_of_any_lab(job.spec.calibration).await?, job.spec.registered))
         };
         match found.await {
             Ok(found) => Ok(Some(found)),

@@ -11,14 +11,14 @@ use crate::error::{Result, StoreError};
 use crate::staging::{StagedBlob, StagedDir};
 use crate::tables::blobs::Origin;
 use crate::tables::reservations::reservations;
+use crate::tables::resources::{self, NewCalibration, NewMeasurement, NewModel};
 use crate::tables::tasks::Owner;
-use crate::tables::things::{self, NewCalibration, NewMeasurement, NewModel};
 use crate::tables::{quota, reports, requests, results, sums};
 use crate::{Store, dir, on_files};
 use engine::intake::Refusal;
 use engine::job::{
     Assessment, CalibrationId, CalibrationReport, JobId, MeasurementId, ModelId, Registered,
-    Sha256, Submission, TaskKind, TaskProgress, TaskState, ThingId, Timestamp, WrittenFile,
+    ResourceId, Sha256, Submission, TaskKind, TaskProgress, TaskState, Timestamp, WrittenFile,
     planned_seconds,
 };
 
@@ -85,7 +85,7 @@ impl Store {
                 result = Some(staged.sha256());
                 self.publish(&mut transaction, staged, Origin::Tile).await?;
             }
-            (Owner::Thing(_), Product::File(staged))
+            (Owner::Resource(_), Product::File(staged))
                 if matches!(kind, TaskKind::Movie { .. } | TaskKind::Gif { .. }) =>
             {
                 result = Some(staged.sha256());
@@ -95,14 +95,14 @@ impl Store {
                 results::record(&mut transaction, job, kind.snapshot(), &files).await?;
                 self.put_files(job, kind, staged, files).await?;
             }
-            (Owner::Thing(id), Product::Calibration(done)) if kind == TaskKind::Calibration => {
+            (Owner::Resource(id), Product::Calibration(done)) if kind == TaskKind::Calibration => {
                 self.calibrated(&mut transaction, id.into(), *done).await?;
             }
-            (Owner::Thing(id), Product::Checked(checked)) if kind == TaskKind::Check => {
+            (Owner::Resource(id), Product::Checked(checked)) if kind == TaskKind::Check => {
                 self.checked(&mut transaction, id, *checked).await?;
             }
             (Owner::Job(_), Product::Calibration(_) | Product::Checked(_))
-            | (Owner::Thing(_), _) => {
+            | (Owner::Resource(_), _) => {
                 let value = kind.into_str().to_owned();
                 return Err(StoreError::Corrupt { column: "kind", value });
             }
@@ -157,7 +157,7 @@ impl Store {
     async fn checked(
         &self,
         transaction: &mut SqliteConnection,
-        id: ThingId,
+        id: ResourceId,
         checked: Checked,
     ) -> Result<()> {
         let seconds = match checked {
@@ -165,18 +165,25 @@ impl Store {
                 let prepared = staged.sha256();
                 let seconds = planned_seconds(0, facts.frames, facts.height * facts.width);
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                things::record::<CalibrationId>(transaction, id.into(), prepared, &*facts).await?;
+                resources::record::<CalibrationId>(transaction, id.into(), prepared, &*facts)
+                    .await?;
                 seconds
             }
             Checked::Captures(seconds) => seconds,
             Checked::Measurement(facts, staged) => {
                 let prepared = staged.sha256();
                 self.publish(transaction, staged, Origin::Prepared).await?;
-                return things::record::<MeasurementId>(transaction, id.into(), prepared, &*facts)
-                    .await;
+                return resources::record::<MeasurementId>(
+                    transaction,
+                    id.into(),
+                    prepared,
+                    &*facts,
+                )
+                .await;
             }
             Checked::Model(facts) => {
-                return things::record::<ModelId>(transaction, id.into(), facts.file, &facts).await;
+                return resources::record::<ModelId>(transaction, id.into(), facts.file, &facts)
+                    .await;
             }
             Checked::Refused(refusal) => return requests::refuse(transaction, id, &refusal).await,
         };
@@ -194,7 +201,7 @@ impl Store {
         (copies, min_free): (u64, u64),
     ) -> Result<()> {
         let mut transaction = self.write().await?;
-        let Some((Owner::Thing(id), _)) = lease::held(&mut transaction, lease).await? else {
+        let Some((Owner::Resource(id), _)) = lease::held(&mut transaction, lease).await? else {
             return Err(StoreError::Interrupted);
         };
         // An earlier attempt may have reserved its own.
@@ -225,7 +232,7 @@ impl Store {
             self.publish(transaction, staged, Origin::Prepared).await?;
             // The worker that makes masks knows nothing of colours.
             let facts = NewCalibration { mosaic: request.mosaic, ..facts };
-            things::record(transaction, id, prepared, &facts).await?;
+            resources::record(transaction, id, prepared, &facts).await?;
         }
         // The worker that makes the report reads the masks alone.
         let report = CalibrationReport { registration_of: request.registration_of, ..report };

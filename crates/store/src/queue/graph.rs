@@ -6,7 +6,7 @@ use sqlx::SqliteConnection;
 use crate::columns::sql;
 use crate::error::{Result, StoreError};
 use crate::tables::{labs, results, sums, tasks};
-use engine::job::{JobId, JobSpec, Lab, RunSpec, TaskId, TaskKind, TaskState, ThingId};
+use engine::job::{JobId, JobSpec, Lab, ResourceId, RunSpec, TaskId, TaskKind, TaskState};
 
 /// Above all others: a client waits for the check of its upload.
 const CHECK_PRIORITY: i32 = 2000;
@@ -58,14 +58,14 @@ pub async fn insert(
     sums::recount(connection, job).await
 }
 
-/// Writes a task that makes a thing, or something of it, with its planned CPU-seconds.
+/// Writes a task that makes a resource, or something of it, with its planned CPU-seconds.
 pub async fn insert_for(
     connection: &mut SqliteConnection,
-    (lab, thing): (&Lab, ThingId),
+    (lab, resource): (&Lab, ResourceId),
     kind: TaskKind,
     cost: f64,
 ) -> Result<()> {
-    // The ordinal is the order of the tasks of one thing.
+    // The ordinal is the order of the tasks of one resource.
     let (priority, ordinal) = match kind {
         TaskKind::Check => (CHECK_PRIORITY, 0),
         TaskKind::Movie { .. } | TaskKind::Gif { .. } => (MOVIE_PRIORITY, 1),
@@ -76,7 +76,7 @@ pub async fn insert_for(
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             TaskId::new(),
-            thing,
+            resource,
             lab,
             ordinal,
             kind.into_str(),

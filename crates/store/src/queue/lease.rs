@@ -296,7 +296,7 @@ pub(super) async fn lose(
     let wanted = match owner {
         Owner::Job(job) => job::is_wanted(connection, job).await?,
         // Its task would have been deleted with it.
-        Owner::Thing(_) => true,
+        Owner::Resource(_) => true,
     };
     let (outcome, reason, mut hopeless) = match loss {
         Loss::Released if wanted => (Outcome::Released, None, false),
@@ -341,7 +341,7 @@ pub(super) async fn lose(
     .await?;
     let job = match owner {
         Owner::Job(job) => job,
-        Owner::Thing(id) if state == TaskState::Failed => {
+        Owner::Resource(id) if state == TaskState::Failed => {
             let refusal = match loss {
                 Loss::Failed(reason, false) => Refusal::new(RefusalCode::InvalidContent, reason),
                 _ if fatal => Refusal::new(
@@ -353,7 +353,7 @@ pub(super) async fn lose(
             // A movie has no request; the reason is that of its last attempt.
             return requests::refuse(connection, id, &refusal).await;
         }
-        Owner::Thing(_) => return Ok(()),
+        Owner::Resource(_) => return Ok(()),
     };
     if state == TaskState::Failed {
         let error =

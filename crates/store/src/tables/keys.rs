@@ -11,10 +11,10 @@ use crate::columns::{sql, sql_as};
 use crate::error::{Result, StoreError};
 use engine::job::{InvalidId, JobId, Lab, Sha256};
 
-/// The kind of thing that a key creates, named as in the column `what`.
+/// The kind of resource that a key creates, named as in the column `what`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
 #[strum(serialize_all = "lowercase", const_into_str)]
-pub enum Made {
+pub enum ResourceKind {
     Calibration,
     Job,
     Measurement,
@@ -22,7 +22,7 @@ pub enum Made {
     Upload,
 }
 
-/// A user's key against making a thing twice, and the hash of the request that came with it.
+/// A user's key against creating a resource twice, and the hash of the request that came with it.
 #[derive(Debug, Clone)]
 pub struct RequestKey {
     pub key: String,
@@ -46,12 +46,12 @@ impl<Id> Inserted<Id> {
 }
 
 impl Store {
-    /// The thing of this kind that the lab made with this key, if it made one and it is still there.
+    /// The resource of this kind that the lab made with this key, if it made one and it is still there.
     /// Errors: [`StoreError::KeyReused`] if it asked for another one with it.
-    pub async fn made_with<Id>(
+    pub async fn created_with<Id>(
         &self,
         lab: &Lab,
-        what: Made,
+        what: ResourceKind,
         key: Option<&RequestKey>,
     ) -> Result<Option<Id>>
     where
@@ -62,11 +62,11 @@ impl Store {
     }
 }
 
-/// As [`Store::made_with`].
+/// As [`Store::created_with`].
 pub async fn found<Id>(
     connection: &mut SqliteConnection,
     lab: &Lab,
-    what: Made,
+    what: ResourceKind,
     key: Option<&RequestKey>,
 ) -> Result<Option<Id>>
 where
@@ -93,7 +93,7 @@ where
 pub async fn insert(
     connection: &mut SqliteConnection,
     lab: &Lab,
-    what: Made,
+    what: ResourceKind,
     key: Option<&RequestKey>,
     id: impl Display,
 ) -> Result<()> {

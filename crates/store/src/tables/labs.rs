@@ -151,16 +151,6 @@ impl Store {
         Ok(found.fetch_optional(&self.readers).await?.is_some())
     }
 
-    /// Share and limits of a lab.
-    pub async fn entitlement(&self, lab: &Lab) -> Result<Entitlement> {
-        let found = sql_as!("SELECT share, max_bytes, max_jobs FROM labs WHERE lab = ?", [lab]);
-        let found: Option<(f64, Option<u64>, Option<u64>)> =
-            found.fetch_optional(&self.readers).await?;
-        let (share, max_bytes, max_jobs) = found.unwrap_or((1.0, None, None));
-        let (max_bytes, max_jobs) = (Some(max_bytes), Some(max_jobs));
-        Ok(Entitlement { share: Some(share), max_bytes, max_jobs })
-    }
-
     /// Sets the default limits of labs.
     pub async fn set_default_limits(&self, max_bytes: u64, max_jobs: u64) -> Result<()> {
         sql!(

@@ -10,7 +10,7 @@ use crate::columns::{from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::locked::LockedFile;
 use crate::rows::{Expired, Page};
-use crate::tables::keys::{self, Inserted, Made, RequestKey};
+use crate::tables::keys::{self, Inserted, RequestKey, ResourceKind};
 use crate::tables::quota;
 use crate::{Store, dir, on_files};
 use engine::job::{Lab, PartialId, Sha256, Timestamp, TokenId};
@@ -181,7 +181,9 @@ impl Store {
         key: Option<&RequestKey>,
     ) -> Result<Inserted<PartialId>> {
         let mut transaction = self.write().await?;
-        if let Some(before) = keys::found(&mut transaction, &facts.lab, Made::Upload, key).await? {
+        if let Some(before) =
+            keys::found(&mut transaction, &facts.lab, ResourceKind::Upload, key).await?
+        {
             return Ok(Inserted::Before(before));
         }
         quota::check_partials(&mut transaction, &facts.lab).await?;
@@ -201,7 +203,7 @@ impl Store {
         )
         .execute(&mut *transaction)
         .await?;
-        keys::insert(&mut transaction, &facts.lab, Made::Upload, key, id).await?;
+        keys::insert(&mut transaction, &facts.lab, ResourceKind::Upload, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id))
     }

@@ -1,8 +1,8 @@
 //! Table `requests`: calibrations, measurements and models as labs asked for them.
 //!
-//! A request stands here for as long as the thing that it asked for, ready or not. Tasks of the queue fulfil it: a
-//! check of its uploads, and, for a calibration, one that makes masks or a report. The thing's facts are added once they
-//! are known; see `things.rs`.
+//! A request stands here for as long as the resource that it asked for, ready or not. Tasks of the queue fulfil it: a
+//! check of its uploads, and, for a calibration, one that makes masks or a report. The resource's facts are added once they
+//! are known; see `resources.rs`.
 
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
@@ -11,17 +11,17 @@ use crate::Store;
 use crate::columns::{Columns, FromRow, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Reference, require};
-use crate::tables::keys::Made;
+use crate::tables::keys::ResourceKind;
 use engine::intake::Refusal;
 use engine::job::{
-    CheckLimits, Lab, Label, Sha256, Submission, TaskState, ThingId, Timestamp, TokenId,
+    CheckLimits, Lab, Label, ResourceId, Sha256, Submission, TaskState, Timestamp, TokenId,
 };
 
 /// A request with its progress.
 #[derive(Debug, Clone)]
 pub struct Request {
     /// Identifier of the calibration, measurement or model.
-    pub id: ThingId,
+    pub id: ResourceId,
     pub lab: Lab,
     pub token: Option<TokenId>,
     pub name: Option<Label>,
@@ -35,8 +35,8 @@ pub struct Request {
     pub fraction: f64,
 }
 
-impl Made {
-    /// The kind of thing that a submission makes.
+impl ResourceKind {
+    /// The kind of resource that a submission makes.
     pub fn of(submission: &Submission) -> Self {
         match submission {
             Submission::Calibration(_) => Self::Calibration,
@@ -84,22 +84,26 @@ macro_rules! requests {
 pub(super) use requests;
 
 impl Store {
-    /// The lab's request for this thing; none if there is none.
-    pub async fn find_request(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<Option<Request>> {
+    /// The lab's request for this resource; none if there is none.
+    pub async fn find_request(
+        &self,
+        lab: &Lab,
+        id: impl Into<ResourceId>,
+    ) -> Result<Option<Request>> {
         let request = concat!("SELECT * FROM ", requests!(), " WHERE id = ? AND lab = ?");
         let request = sql_as!(request, [id.into(), lab]);
         request.fetch_optional(&self.readers).await
     }
 
     /// True if the uploads of a request are checked, or the request was deleted.
-    pub async fn is_checked(&self, id: impl Into<ThingId>) -> Result<bool> {
+    pub async fn is_checked(&self, id: impl Into<ResourceId>) -> Result<bool> {
         let check = "SELECT 1 FROM tasks WHERE thing = ? AND kind = 'check' AND state IN (?, ?)";
         let check = sql!(check, [id.into(), TaskState::Ready, TaskState::Running]);
         Ok(check.fetch_optional(&self.readers).await?.is_none())
     }
 
     /// True if a request is fulfilled, refused or deleted.
-    pub async fn is_settled(&self, lab: &Lab, id: impl Into<ThingId>) -> Result<bool> {
+    pub async fn is_settled(&self, lab: &Lab, id: impl Into<ResourceId>) -> Result<bool> {
         let pending = "SELECT 1 FROM requests
                        WHERE id = ?1 AND lab = ?2 AND refusal IS NULL AND facts IS NULL";
         let pending = sql!(pending, [id.into(), lab]);
@@ -108,7 +112,7 @@ impl Store {
 
     /// Removes a request that its check refused. False if there is no such request, as of captures that passed the
     /// check and could not be used.
-    pub async fn drop_refused(&self, id: impl Into<ThingId>) -> Result<bool> {
+    pub async fn drop_refused(&self, id: impl Into<ResourceId>) -> Result<bool> {
         let dropped = "DELETE FROM requests WHERE id = ?1 AND refusal IS NOT NULL
                        AND NOT EXISTS (SELECT 1 FROM tasks WHERE thing = ?1 AND kind = 'calibration')";
         let dropped = sql!(dropped, [id.into()]).execute(self.writer()?).await?;
@@ -121,7 +125,7 @@ impl Store {
 pub async fn insert(
     connection: &mut SqliteConnection,
     (lab, token): (&Lab, Option<TokenId>),
-    id: ThingId,
+    id: ResourceId,
     (submission, limits, origin): (&Submission, &CheckLimits, Option<&str>),
 ) -> Result<u64> {
     let calibration = submission.calibration();
@@ -141,7 +145,7 @@ pub async fn insert(
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             id,
-            Made::of(submission).into_str(),
+            ResourceKind::of(submission).into_str(),
             lab,
             token,
             submission.name(),
@@ -164,22 +168,22 @@ pub async fn insert(
     sql_as!(size, [id]).fetch_one(connection).await
 }
 
-/// The request for this thing, whoever made it.
-pub async fn find(connection: &mut SqliteConnection, id: ThingId) -> Result<Request> {
+/// The request for this resource, whoever made it.
+pub async fn find(connection: &mut SqliteConnection, id: ResourceId) -> Result<Request> {
     let request = sql_as!(concat!("SELECT * FROM ", requests!(), " WHERE id = ?"), [id]);
     let request = request.fetch_optional(connection).await?;
     request.ok_or_else(|| StoreError::missing("request", id))
 }
 
 /// The limits of a request's check.
-pub async fn limits(connection: &mut SqliteConnection, id: ThingId) -> Result<CheckLimits> {
+pub async fn limits(connection: &mut SqliteConnection, id: ResourceId) -> Result<CheckLimits> {
     let limits = sql_as!("SELECT limits FROM requests WHERE id = ?", [id]);
     let Json(limits) = limits.fetch_one(connection).await?;
     Ok(limits)
 }
 
 /// Reserves disk space for the product of a request, until its row is written or the request is refused.
-pub async fn promise(connection: &mut SqliteConnection, id: ThingId, bytes: u64) -> Result<()> {
+pub async fn promise(connection: &mut SqliteConnection, id: ResourceId, bytes: u64) -> Result<()> {
     sql!("UPDATE requests SET prepared_bytes = ? WHERE id = ?", [bytes, id])
         .execute(connection)
         .await?;
@@ -187,7 +191,11 @@ pub async fn promise(connection: &mut SqliteConnection, id: ThingId, bytes: u64)
 }
 
 /// Ends what a request held for being fulfilled: its promise, and its uploads except `kept`.
-pub async fn fulfil(connection: &mut SqliteConnection, id: ThingId, kept: &[Sha256]) -> Result<()> {
+pub async fn fulfil(
+    connection: &mut SqliteConnection,
+    id: ResourceId,
+    kept: &[Sha256],
+) -> Result<()> {
     promise(connection, id, 0).await?;
     let unused = "DELETE FROM request_files
                   WHERE id = ? AND sha256 NOT IN (SELECT value FROM json_each(?))";
@@ -199,7 +207,7 @@ pub async fn fulfil(connection: &mut SqliteConnection, id: ThingId, kept: &[Sha2
 /// and lacks its report stays unchanged.
 pub async fn refuse(
     connection: &mut SqliteConnection,
-    id: ThingId,
+    id: ResourceId,
     refusal: &Refusal,
 ) -> Result<()> {
     let refused =

@@ -11,7 +11,7 @@ use strum::{VariantArray, VariantNames};
 use crate::Store;
 use crate::columns::{Columns, Json, from_row, sql, sql_as};
 use crate::error::{Result, StoreError};
-use engine::job::{JobId, RunSpec, Sha256, TaskKind, TaskState, ThingId};
+use engine::job::{JobId, ResourceId, RunSpec, Sha256, TaskKind, TaskState};
 
 /// Owner of a task, with which it is deleted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,7 +19,7 @@ pub enum Owner {
     /// The job that it belongs to.
     Job(JobId),
     /// The calibration, measurement, model or job for which it makes something. A job's state does not follow it.
-    Thing(ThingId),
+    Resource(ResourceId),
 }
 
 #[derive(Debug, Clone)]
@@ -313,6 +313,6 @@ pub fn kind(row: &SqliteRow) -> Result<TaskKind> {
 pub fn owner(row: &SqliteRow) -> Result<Owner> {
     Ok(match row.read("job")? {
         Some(job) => Owner::Job(job),
-        None => Owner::Thing(row.read("thing")?),
+        None => Owner::Resource(row.read("thing")?),
     })
 }

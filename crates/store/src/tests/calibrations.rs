@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::{LEASE, Lab, new_request};
 use crate::{
-    Asked, CalibrationDone, Checked, ClaimedTask, Completion, Heartbeat, MAX_FAILURES,
+    CalibrationDone, Checked, ClaimedTask, Completion, FoundResource, Heartbeat, MAX_FAILURES,
     NewCalibration, Product, Request, StoreError, Work, WorkerEnd,
 };
 use engine::job::{
@@ -57,9 +57,9 @@ impl Lab {
     }
 
     async fn unready(&self, id: CalibrationId) -> Option<Request> {
-        match self.store.asked(&engine::job::Lab::local(), id).await.unwrap() {
-            Asked::Ready(_) => None,
-            Asked::Pending(request) => Some(*request),
+        match self.store.resource(&engine::job::Lab::local(), id).await.unwrap() {
+            FoundResource::Ready(_) => None,
+            FoundResource::Pending(request) => Some(*request),
         }
     }
 

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use super::{LEASE, Lab, checked, id, new_request};
 use crate::{
-    Asked, Checked, Claimant, Entitlement, Heartbeat, Inserted, RequestKey, StoreError, Work,
-    WorkerEnd,
+    Checked, Claimant, Entitlement, FoundResource, Heartbeat, Inserted, RequestKey, StoreError,
+    Work, WorkerEnd,
 };
 use engine::intake::{Refusal, RefusalCode};
 use engine::job::{
@@ -224,10 +224,10 @@ async fn lists_hold_what_is_there_and_what_is_not_in_one_order() {
     let mut seen = Vec::new();
     let mut filter = crate::Filter::default();
     loop {
-        let page = lab.store.things(&local, filter, 2).await.unwrap();
+        let page = lab.store.resources(&local, filter, 2).await.unwrap();
         seen.extend(page.items.iter().map(|item| match item {
-            Asked::Ready(measurement) => (measurement.id, true),
-            Asked::Pending(request) => (request.id.into(), false),
+            FoundResource::Ready(measurement) => (measurement.id, true),
+            FoundResource::Pending(request) => (request.id.into(), false),
         }));
         if !page.more {
             break;

@@ -120,12 +120,16 @@ async fn totals_equal_new_sums_after_random_operations() {
                 drop(lab.store.remove_lab(&named(1 + random.below(2))).await);
                 for asked in lab
                     .store
-                    .things(&named(0), crate::Filter::<engine::job::MeasurementId>::default(), 100)
+                    .resources(
+                        &named(0),
+                        crate::Filter::<engine::job::MeasurementId>::default(),
+                        100,
+                    )
                     .await
                     .unwrap()
                     .items
                 {
-                    if let crate::Asked::Ready(found) = asked
+                    if let crate::FoundResource::Ready(found) = asked
                         && found.id != lab.measurement
                         && random.below(2) == 0
                     {

@@ -137,10 +137,6 @@ async fn throughput(connection: &Connection) -> Vec<Check> {
     let input = Input { sha256: Sha256::of(&bytes), bytes: WINDOW as u64 };
     let Ok(pool) = "check".parse::<Pool>() else { return Vec::new() };
     let prefix = names::input(&pool, input.sha256);
-    let rate = |start: Instant| {
-        let seconds = start.elapsed().as_secs_f64();
-        format!("4.4 MB in {:.0} ms, {:.0} MB/s", seconds * 1e3, WINDOW as f64 / 1e6 / seconds)
-    };
     let start = Instant::now();
     let put = connection.put(&prefix, Bytes::from(bytes)).await;
     let mut checks = vec![Check::of("a window out", put, |()| rate(start))];
@@ -158,6 +154,12 @@ async fn throughput(connection: &Connection) -> Vec<Check> {
         checks.push(Check::new("purge", false, error.to_string()));
     }
     checks
+}
+
+/// Time and rate of a window that was sent or fetched since `start`.
+fn rate(start: Instant) -> String {
+    let seconds = start.elapsed().as_secs_f64();
+    format!("4.4 MB in {:.0} ms, {:.0} MB/s", seconds * 1e3, WINDOW as f64 / 1e6 / seconds)
 }
 
 async fn clocks(connection: &Connection, subject: &str) -> Check {
@@ -196,13 +198,7 @@ fn compared(time: SystemTime, before: SystemTime, after: SystemTime) -> Check {
 /// Checks what a worker of a pool needs.
 async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<Check> {
     let worker = WorkerId::new();
-    let hello = Hello {
-        worker,
-        host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
-        pid: std::process::id(),
-        device: "check".into(),
-        program,
-    };
+    let hello = Hello::new(worker, "check".into(), program);
     let mut checks = welcome(connection, pool, &hello).await;
     let consumer = connection.pool(pool).await;
     checks.push(Check::of("the pool's tiles", consumer, |consumer| {
@@ -213,10 +209,7 @@ async fn worker(connection: &Connection, pool: &Pool, program: Program) -> Vec<C
     let bytes = vec![7; WINDOW];
     let start = Instant::now();
     let put = connection.put(&prefix, Bytes::from(bytes)).await;
-    checks.push(Check::of("frames of a tile out", put, |()| {
-        let seconds = start.elapsed().as_secs_f64();
-        format!("4.4 MB in {:.0} ms, {:.0} MB/s", seconds * 1e3, WINDOW as f64 / 1e6 / seconds)
-    }));
+    checks.push(Check::of("frames of a tile out", put, |()| rate(start)));
     // No input has this name. A worker without the right to read gets a different error.
     let absent = Input { sha256: Sha256::of(b"nothing"), bytes: 1 };
     let got = connection.get(names::INPUTS, &names::input(pool, absent.sha256), absent).await;

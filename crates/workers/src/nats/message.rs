@@ -155,6 +155,14 @@ pub struct Hello {
     pub program: Program,
 }
 
+impl Hello {
+    /// Introduces a worker in this process.
+    pub fn new(worker: WorkerId, device: String, program: Program) -> Self {
+        let host = rustix::system::uname().nodename().to_string_lossy().into_owned();
+        Self { worker, host, pid: std::process::id(), device, program }
+    }
+}
+
 /// The answer to [`Hello`].
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

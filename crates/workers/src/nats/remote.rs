@@ -159,15 +159,12 @@ impl Remote {
                 reason: "it names no pool: state one with --pool".into(),
             })?;
         let cache = Cache::open(&settings.cache.0, settings.cache.1)?;
-        let host = rustix::system::uname().nodename().to_string_lossy().into_owned();
-        let name = format!("sci-recon worker {host}");
+        let hello = Hello::new(worker, settings.device, settings.program);
+        let name = format!("sci-recon worker {}", hello.host);
         let connection =
             Access::new(settings.urls.as_deref(), &credential, &name)?.connect().await?;
         let notices = connection.client.subscribe(names::notice(&pool, worker)).await;
         let notices = notices.map_err(ClusterError::nats("listen to the server"))?;
-        let device = settings.device;
-        let hello =
-            Hello { worker, host, pid: std::process::id(), device, program: settings.program };
         let (start, mut pause) = (Instant::now(), RETRY_PAUSE);
         let ack_wait = loop {
             if let Some(ack_wait) = introduce(&connection, &pool, &hello).await? {

@@ -12,19 +12,26 @@ use crate::Store;
 use crate::columns::{Columns, FromRow, Json, sql, sql_as};
 use crate::error::{Result, StoreError};
 use crate::rows::{Filter, Page, refuse_if_used};
-use crate::tables::keys::Made;
+use crate::tables::keys::ResourceKind;
 use crate::tables::requests::{self, Request};
 use engine::job::{
     CalibrationId, CalibrationRequest, CorrectedMasks, Dispersion, Finding, InvalidId, JobModel,
     Lab, Label, MaskInputs, MeasurementId, MeasurementInputs, MeasurementRequest, ModelFacts,
-    ModelId, ModelRequest, Mosaic, Reading, Sequence, Sha256, ThingId, Timestamp,
+    ModelId, ModelRequest, Mosaic, Reading, ResourceId, Sequence, Sha256, Timestamp,
 };
 
 /// The identifier of a calibration, a measurement or a model.
 pub trait Resource:
-    Copy + Debug + Display + Send + Sync + Into<ThingId> + From<ThingId> + FromStr<Err = InvalidId>
+    Copy
+    + Debug
+    + Display
+    + Send
+    + Sync
+    + Into<ResourceId>
+    + From<ResourceId>
+    + FromStr<Err = InvalidId>
 {
-    const KIND: Made;
+    const KIND: ResourceKind;
     /// The request for one.
     type Request: Debug + Clone + PartialEq + Serialize + DeserializeOwned + Send + Sync;
     /// The facts that are known once it has passed its check.
@@ -32,26 +39,26 @@ pub trait Resource:
 }
 
 impl Resource for CalibrationId {
-    const KIND: Made = Made::Calibration;
+    const KIND: ResourceKind = ResourceKind::Calibration;
     type Request = CalibrationRequest;
     type Facts = NewCalibration;
 }
 
 impl Resource for MeasurementId {
-    const KIND: Made = Made::Measurement;
+    const KIND: ResourceKind = ResourceKind::Measurement;
     type Request = MeasurementRequest;
     type Facts = NewMeasurement;
 }
 
 impl Resource for ModelId {
-    const KIND: Made = Made::Model;
+    const KIND: ResourceKind = ResourceKind::Model;
     type Request = ModelRequest;
     type Facts = NewModel;
 }
 
 /// A calibration, measurement or model that is ready.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Thing<Id: Resource> {
+pub struct ReadyResource<Id: Resource> {
     pub id: Id,
     pub name: Option<Label>,
     /// Hash of the file that jobs read: masks [B, H, W] on [0, 1], or snapshots [S, H, W] with the full scale divided
@@ -62,27 +69,27 @@ pub struct Thing<Id: Resource> {
     pub facts: Id::Facts,
 }
 
-pub type Calibration = Thing<CalibrationId>;
-pub type Measurement = Thing<MeasurementId>;
-pub type Model = Thing<ModelId>;
+pub type Calibration = ReadyResource<CalibrationId>;
+pub type Measurement = ReadyResource<MeasurementId>;
+pub type Model = ReadyResource<ModelId>;
 
-/// A thing that a lab asked for.
+/// A calibration, measurement or model that a lab asked for.
 #[derive(Debug, Clone)]
-pub enum Asked<Id: Resource> {
-    Ready(Thing<Id>),
+pub enum FoundResource<Id: Resource> {
+    Ready(ReadyResource<Id>),
     /// It is being checked or made, or was refused.
     Pending(Box<Request>),
 }
 
-impl<Id: Resource> FromRow for Asked<Id> {
+impl<Id: Resource> FromRow for FoundResource<Id> {
     fn from_row(row: &SqliteRow) -> Result<Self> {
         let Some(facts) = row.read_json("facts")? else {
             return Ok(Self::Pending(Box::new(Request::from_row(row)?)));
         };
-        let (id, name) = (row.read::<ThingId>("id")?.into(), row.read("name")?);
+        let (id, name) = (row.read::<ResourceId>("id")?.into(), row.read("name")?);
         let (prepared, created_at) = (row.read("prepared")?, row.read("created_at")?);
         let Json(request) = row.read("request")?;
-        Ok(Self::Ready(Thing { id, name, prepared, created_at, request, facts }))
+        Ok(Self::Ready(ReadyResource { id, name, prepared, created_at, request, facts }))
     }
 }
 
@@ -180,55 +187,62 @@ impl Store {
     /// The lab's calibration with this identifier.
     /// Errors: [`StoreError::NotReady`] if its masks are not there.
     pub async fn calibration(&self, lab: &Lab, id: CalibrationId) -> Result<Calibration> {
-        ready(id, self.asked(lab, id).await?)
+        ready(id, self.resource(lab, id).await?)
     }
 
     /// The lab's measurement with this identifier.
     /// Errors: [`StoreError::NotReady`] if it has not passed its check.
     pub async fn measurement(&self, lab: &Lab, id: MeasurementId) -> Result<Measurement> {
-        ready(id, self.asked(lab, id).await?)
+        ready(id, self.resource(lab, id).await?)
     }
 
     /// The lab's model with this identifier. One that has not passed its check does not exist.
     pub async fn model(&self, lab: &Lab, id: ModelId) -> Result<Model> {
-        match self.asked(lab, id).await? {
-            Asked::Ready(model) => Ok(model),
-            Asked::Pending(_) => Err(StoreError::missing("model", id)),
+        match self.resource(lab, id).await? {
+            FoundResource::Ready(model) => Ok(model),
+            FoundResource::Pending(_) => Err(StoreError::missing("model", id)),
         }
     }
 
     /// The lab's calibration, measurement or model with this identifier, ready or pending.
-    pub async fn asked<Id: Resource>(&self, lab: &Lab, id: Id) -> Result<Asked<Id>> {
-        self.find_thing(Some(lab), id).await
+    pub async fn resource<Id: Resource>(&self, lab: &Lab, id: Id) -> Result<FoundResource<Id>> {
+        self.find_resource(Some(lab), id).await
     }
 
     /// A calibration or measurement of any lab, for workers, which serve all labs.
-    pub(crate) async fn thing_of_any_lab<Id: Resource>(&self, id: Id) -> Result<Thing<Id>> {
-        ready(id, self.find_thing(None, id).await?)
+    pub(crate) async fn resource_of_any_lab<Id: Resource>(
+        &self,
+        id: Id,
+    ) -> Result<ReadyResource<Id>> {
+        ready(id, self.find_resource(None, id).await?)
     }
 
-    async fn find_thing<Id: Resource>(&self, lab: Option<&Lab>, id: Id) -> Result<Asked<Id>> {
-        let (thing, what): (ThingId, _) = (id.into(), Id::KIND.into_str());
+    async fn find_resource<Id: Resource>(
+        &self,
+        lab: Option<&Lab>,
+        id: Id,
+    ) -> Result<FoundResource<Id>> {
+        let (resource, what): (ResourceId, _) = (id.into(), Id::KIND.into_str());
         let found = sql_as!(
             concat!(
                 "SELECT * FROM ",
                 requests::requests!(),
                 " WHERE id = ?1 AND what = ?2 AND (?3 IS NULL OR lab = ?3)"
             ),
-            [thing, what, lab]
+            [resource, what, lab]
         );
         let found = found.fetch_optional(&self.readers).await?;
         found.ok_or_else(|| StoreError::missing(what, id))
     }
 
     /// A page of the lab's calibrations, measurements or models, newest first. Models that are not ready are left out.
-    pub async fn things<Id: Resource>(
+    pub async fn resources<Id: Resource>(
         &self,
         lab: &Lab,
         filter: Filter<Id>,
         limit: u32,
-    ) -> Result<Page<Asked<Id>>> {
-        let after: Option<ThingId> = filter.after.map(Into::into);
+    ) -> Result<Page<FoundResource<Id>>> {
+        let after: Option<ResourceId> = filter.after.map(Into::into);
         let items = sql_as!(
             concat!(
                 "SELECT * FROM ",
@@ -258,9 +272,9 @@ impl Store {
         id: Id,
         name: Option<&Label>,
     ) -> Result<()> {
-        let (thing, what): (ThingId, _) = (id.into(), Id::KIND.into_str());
+        let (resource, what): (ResourceId, _) = (id.into(), Id::KIND.into_str());
         let renamed = "UPDATE requests SET name = ? WHERE id = ? AND lab = ? AND what = ?";
-        let renamed = sql!(renamed, [name, thing, lab, what]).execute(self.writer()?).await?;
+        let renamed = sql!(renamed, [name, resource, lab, what]).execute(self.writer()?).await?;
         let found = renamed.rows_affected() > 0;
         if found { Ok(()) } else { Err(StoreError::missing(what, id)) }
     }
@@ -268,15 +282,15 @@ impl Store {
     /// Deletes a calibration, a measurement or a model that nothing refers to, with its tasks: a worker that has one
     /// learns this from its next heartbeat.
     pub async fn delete<Id: Resource>(&self, lab: &Lab, id: Id) -> Result<()> {
-        let (thing, what): (ThingId, _) = (id.into(), Id::KIND.into_str());
+        let (resource, what): (ResourceId, _) = (id.into(), Id::KIND.into_str());
         let mut transaction = self.write().await?;
         let found = "SELECT prepared FROM requests WHERE id = ? AND lab = ? AND what = ?";
-        let found = sql_as!(found, [thing, lab, what]).fetch_optional(&mut *transaction).await?;
+        let found = sql_as!(found, [resource, lab, what]).fetch_optional(&mut *transaction).await?;
         let prepared: Option<Sha256> = found.ok_or_else(|| StoreError::missing(what, id))?;
         for users in users(Id::KIND) {
             refuse_if_used(&mut transaction, (what, id.to_string()), *users).await?;
         }
-        sql!("DELETE FROM requests WHERE id = ?", [thing]).execute(&mut *transaction).await?;
+        sql!("DELETE FROM requests WHERE id = ?", [resource]).execute(&mut *transaction).await?;
         if let Some(prepared) = prepared {
             self.release(&mut transaction, prepared).await?;
         }
@@ -284,10 +298,10 @@ impl Store {
     }
 }
 
-fn ready<Id: Resource>(id: Id, asked: Asked<Id>) -> Result<Thing<Id>> {
-    match asked {
-        Asked::Ready(thing) => Ok(thing),
-        Asked::Pending(request) => Err(StoreError::NotReady {
+fn ready<Id: Resource>(id: Id, found: FoundResource<Id>) -> Result<ReadyResource<Id>> {
+    match found {
+        FoundResource::Ready(resource) => Ok(resource),
+        FoundResource::Pending(request) => Err(StoreError::NotReady {
             what: Id::KIND.into_str(),
             id: id.to_string(),
             error: request.refusal.map(|refusal| refusal.detail),
@@ -295,10 +309,10 @@ fn ready<Id: Resource>(id: Id, asked: Asked<Id>) -> Result<Thing<Id>> {
     }
 }
 
-/// Names of the resources that may refer to a thing of this kind, each with a query that counts them.
-fn users(what: Made) -> &'static [(&'static str, &'static str)] {
+/// Names of the resources that may refer to a resource of this kind, each with a query that counts them.
+fn users(what: ResourceKind) -> &'static [(&'static str, &'static str)] {
     match what {
-        Made::Calibration => &[
+        ResourceKind::Calibration => &[
             (
                 "measurements",
                 "SELECT count(*) FROM requests
@@ -310,26 +324,26 @@ fn users(what: Made) -> &'static [(&'static str, &'static str)] {
                  WHERE calibration = ? AND what = 'model' AND refusal IS NULL",
             ),
         ],
-        Made::Measurement => &[("jobs", "SELECT count(*) FROM jobs WHERE measurement = ?")],
-        Made::Model => &[("jobs", "SELECT count(*) FROM jobs WHERE model = ?")],
-        Made::Job | Made::Upload => &[],
+        ResourceKind::Measurement => &[("jobs", "SELECT count(*) FROM jobs WHERE measurement = ?")],
+        ResourceKind::Model => &[("jobs", "SELECT count(*) FROM jobs WHERE model = ?")],
+        ResourceKind::Job | ResourceKind::Upload => &[],
     }
 }
 
-/// Records the facts of a thing that has passed its check.
+/// Records the facts of a resource that has passed its check.
 pub async fn record<Id: Resource>(
     connection: &mut SqliteConnection,
     id: Id,
     prepared: Sha256,
     facts: &Id::Facts,
 ) -> Result<()> {
-    let thing: ThingId = id.into();
+    let resource: ResourceId = id.into();
     sql!(
         "UPDATE requests SET prepared = ?, facts = ? WHERE id = ?",
-        [prepared, Json(facts), thing]
+        [prepared, Json(facts), resource]
     )
     .execute(&mut *connection)
     .await?;
-    let kept = requests::find(connection, thing).await?.submission.kept_uploads();
-    requests::fulfil(connection, thing, &kept).await
+    let kept = requests::find(connection, resource).await?.submission.kept_uploads();
+    requests::fulfil(connection, resource, &kept).await
 }
