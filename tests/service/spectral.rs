@@ -226,7 +226,9 @@ async fn fractions_rows_and_masks_of_the_measurement_are_reconstructed() {
 
 #[tokio::test]
 async fn wrong_masks_of_a_dark_scene_are_errors() {
-    let side = 160;
+    /// The pixel of the right mask at each pixel of another one.
+    type Place = fn(usize, usize) -> (usize, usize);
+    const SIDE: usize = 160;
     // Three coloured discs that cover a tenth of the picture.
     let spots = |band: usize, row: usize, column: usize| {
         let disc = |i: f32, j: f32, colour: f32| {
@@ -236,15 +238,15 @@ async fn wrong_masks_of_a_dark_scene_are_errors() {
         };
         disc(50.0, 50.0, 1.0) + disc(84.0, 100.0, 4.0) + disc(110.0, 60.0, 6.5)
     };
-    let lab = Lab::of(side, spots, "column", "0:2:8", "scene");
+    let lab = Lab::of(SIDE, spots, "column", "0:2:8", "scene");
     let app = TestApp::start().await;
     let mask = values(&lab.file("masks.npy"));
-    let measured = async |place: &dyn Fn(usize, usize) -> (usize, usize)| {
+    let measured = async |place: Place| {
         let pixel = |at: usize| {
-            let (row, column) = place(at / side, at % side);
-            mask[row.min(side - 1) * side + column.min(side - 1)]
+            let (row, column) = place(at / SIDE, at % SIDE);
+            mask[row.min(SIDE - 1) * SIDE + column.min(SIDE - 1)]
         };
-        let masks = app.upload(npy(&[1, side, side], (0..side * side).map(pixel))).await;
+        let masks = app.upload(npy(&[1, SIDE, SIDE], (0..SIDE * SIDE).map(pixel))).await;
         let body = json!({"masks": masks, "dispersion": lab.dispersion});
         let calibration = id(&app.post("/v1/calibrations", &body).await.expect(201));
         let created = app.measure(&calibration, lab.file("measurement.npy")).await.expect(201);
@@ -252,12 +254,12 @@ async fn wrong_masks_of_a_dark_scene_are_errors() {
         let errors = warnings.iter().filter(|warning| warning["severity"] == "error");
         errors.map(|error| error["code"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
     };
-    assert_eq!(measured(&|row, column| (row, column)).await, [""; 0], "right");
-    let wrong: [(&str, &dyn Fn(usize, usize) -> (usize, usize)); 4] = [
-        ("flipped left to right", &|row, column| (row, side - 1 - column)),
-        ("flipped upside down", &|row, column| (side - 1 - row, column)),
-        ("shifted by one row", &|row, column| (row + 1, column)),
-        ("shifted by one column", &|row, column| (row, column + 1)),
+    assert_eq!(measured(|row, column| (row, column)).await, [""; 0], "right");
+    let wrong: [(&str, Place); 4] = [
+        ("flipped left to right", |row, column| (row, SIDE - 1 - column)),
+        ("flipped upside down", |row, column| (SIDE - 1 - row, column)),
+        ("shifted by one row", |row, column| (row + 1, column)),
+        ("shifted by one column", |row, column| (row, column + 1)),
     ];
     for (name, place) in wrong {
         let errors = measured(place).await;

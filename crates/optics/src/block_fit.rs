@@ -25,11 +25,11 @@ const MIN_GAIN: f64 = 0.15;
 /// Standard errors of a sure statement.
 const SURE: f64 = 3.0;
 /// A shift needs this share of the expected gain, a gain this many times that without a shift, and this many standard
-/// errors. The right masks of the captures gain at most 2 % with 2.8 standard errors, masks shifted by a column 5 to 17 %
-/// with at least 6.8.
+/// errors. The right masks of the captures gain at most 3 % with 4.7 standard errors, masks shifted by a column 5 to 17 %
+/// with at least 6.5.
 const MIN_SHIFTED_GAIN: f64 = 0.2;
-const MIN_IMPROVEMENT: f64 = 1.03;
-const SHIFT_SIGNIFICANCE: f64 = 4.5;
+const MIN_IMPROVEMENT: f64 = 1.04;
+const SHIFT_SIGNIFICANCE: f64 = 5.5;
 
 /// Accumulates the fits of the blocks of some windows.
 #[derive(Debug, Default)]
