@@ -251,8 +251,10 @@ fn explained_after(
     let (mask_columns, y_columns) = cut(width, displacement.columns);
     let mut study = MeasurementStudy::new(frames);
     study.add(masks.slice(s![.., mask_rows, mask_columns]), y.slice(s![y_rows, y_columns]), (0, 0));
-    let figures =
-        study.finish().filter(|figures| figures.pixels > PIXELS_PER_FRAME * frames as f64);
+    // A flat measurement fits any masks with a constant sum.
+    let figures = study
+        .finish()
+        .filter(|figures| figures.pixels > PIXELS_PER_FRAME * frames as f64 && !figures.is_flat);
     figures.map_or(0.0, |figures| figures.explained)
 }
 
