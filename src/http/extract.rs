@@ -9,11 +9,11 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde_json::Value;
 
 use super::access::Access;
 use super::app::App;
 use super::error::{ApiError, Code, Result};
+use super::strict::Strict;
 use engine::job::{InvalidField, Sha256};
 use store::{Inserted, RequestKey};
 
@@ -186,18 +186,29 @@ fn unreadable(error: BytesRejection) -> ApiError {
     ApiError::new(Code::MalformedRequest, error.body_text())
 }
 
-/// Parses a JSON object. An array of the fields in order, which derived implementations also accept, is refused.
 fn parse<T: DeserializeOwned>(bytes: &[u8]) -> Result<T> {
-    let invalid = |pointer: String, text: String| {
-        ApiError::fields(Code::InvalidRequest, vec![InvalidField::new(pointer, text)])
-    };
-    let value: Value = serde_json::from_slice(bytes)
-        .map_err(|error| ApiError::new(Code::MalformedJson, error.to_string()))?;
-    if !value.is_object() {
-        return Err(invalid(String::new(), "a JSON object is expected".into()));
-    }
-    serde_path_to_error::deserialize(value)
-        .map_err(|error| invalid(pointer(error.path()), error.inner().to_string()))
+    let mut deserializer = serde_json::Deserializer::from_slice(bytes);
+    let value = serde_path_to_error::deserialize(Strict(&mut deserializer)).map_err(|error| {
+        let pointer = pointer(error.path());
+        let inner = error.into_inner();
+        if inner.is_data() {
+            ApiError::fields(
+                Code::InvalidRequest,
+                vec![InvalidField::new(pointer, without_position(&inner))],
+            )
+        } else {
+            ApiError::new(Code::MalformedJson, inner.to_string())
+        }
+    })?;
+    deserializer.end().map_err(|error| ApiError::new(Code::MalformedJson, error.to_string()))?;
+    Ok(value)
+}
+
+/// The message of an error in a field. The pointer names the place, so the line and the column are left out.
+fn without_position(error: &serde_json::Error) -> String {
+    let text = error.to_string();
+    let position = format!(" at line {} column {}", error.line(), error.column());
+    text.strip_suffix(&position).map(str::to_owned).unwrap_or(text)
 }
 
 fn pointer(path: &serde_path_to_error::Path) -> String {
@@ -275,8 +286,6 @@ mod tests {
             let pointer = problem["pointer"].as_str().unwrap();
             assert!(pointer.starts_with("/frames"), "{frames}: {pointer}");
         }
-        let list = parse::<CalibrationRequest>(b"[null, null]").unwrap_err();
-        assert_eq!(list.code(), Code::InvalidRequest);
         let cut = parse::<CalibrationRequest>(br#"{"frames":[0,1"#).unwrap_err();
         assert_eq!(cut.code(), Code::MalformedJson);
     }

@@ -49,6 +49,7 @@ mod samples;
 mod session;
 mod shares;
 mod sign_ins;
+mod strict;
 mod submissions;
 mod system;
 mod throttle;

@@ -128,6 +128,13 @@ async fn no_request_takes_an_array_for_an_object() {
         }
     }
     assert_eq!(app.get("/v1/labs/local").await.json()["share"], 1.0);
+    for (pointer, tile) in [("/tile", json!([64, 8])), ("/schedule", json!([[]]))] {
+        let mut body = json!({"measurement": measurement, "algorithm": "gap-tv"});
+        body[&pointer[1..]] = tile;
+        let refused = app.post("/v1/jobs", &body).await;
+        refused.problem(422, "invalid_request");
+        assert_eq!(refused.json()["pointer"], pointer);
+    }
 }
 
 #[tokio::test]

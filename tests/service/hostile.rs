@@ -192,7 +192,7 @@ async fn bodies_that_are_not_json_are_distinguished() {
     };
     post("application/json", Vec::new()).await.problem(400, "empty_body");
     post("application/json", b"{".to_vec()).await.problem(400, "malformed_json");
-    post("application/json", b"{} {}".to_vec()).await.problem(400, "malformed_json");
+    post("application/json", b"{} {}".to_vec()).await.problem(422, "invalid_request");
     post("application/json", vec![0xff, 0xfe]).await.problem(400, "malformed_json");
     post("text/plain", b"{}".to_vec()).await.problem(415, "unsupported_media_type");
     post("application/json", vec![b' '; 300_000]).await.problem(413, "too_large");
