@@ -120,8 +120,10 @@ pub fn judge(
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
         judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
         let places = [FindingCode::TurnedMasks, FindingCode::ShiftedMasks];
-        if dispersion.is_some() && !judged.iter().any(|finding| places.contains(&finding.code)) {
-            let fit = block_study((&masks, &snapshots), snapshot)?.finish();
+        if let Some(dispersion) = dispersion
+            && !judged.iter().any(|finding| places.contains(&finding.code))
+        {
+            let fit = block_study((&masks, &snapshots), snapshot)?.finish(dispersion.axis);
             judged.splice(0..0, fit.as_ref().and_then(judge_blocks));
         }
         let judged = judged.into_iter();
