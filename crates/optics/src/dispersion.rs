@@ -276,18 +276,20 @@ impl Dispersion {
     }
 
     /// True if a finding can be right about a spectral camera. It has one mask for all bands, so findings that compare
-    /// separate masks or look for motion do not apply. The colour of a scene varies from place to place, which looks like an
+    /// separate masks or look for motion do not apply, and a spectral line has the light of one mask. Shifts are
+    /// found block by block. The colour of a scene varies from place to place, which looks like an
     /// offset that the masks do not explain, and like missing modulation.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
-            DeadPixels, DriftedMasks, ExchangedMasks, FastMotion, ForeignMasks, MaskValues,
-            MissingMask, MissingPattern, NegativeOffset, NoDark, OneDimensional, PartlyMovedMasks,
-            RepeatedPattern, ResampledMasks, StuckPixels, SwappedOrder, UnevenPatterns,
-            UnmodulatedArea, WrongDark,
+            BinaryMeasurement, DeadPixels, DriftedMasks, ExchangedMasks, FastMotion, ForeignMasks,
+            MaskValues, MissingMask, MissingPattern, NegativeOffset, NoDark, OneDimensional,
+            PartlyMovedMasks, RepeatedPattern, ResampledMasks, ShiftedMasks, StuckPixels,
+            SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
         };
         !matches!(
             code,
-            DeadPixels
+            BinaryMeasurement
+                | DeadPixels
                 | DriftedMasks
                 | ExchangedMasks
                 | FastMotion
@@ -301,6 +303,7 @@ impl Dispersion {
                 | PartlyMovedMasks
                 | RepeatedPattern
                 | ResampledMasks
+                | ShiftedMasks
                 | StuckPixels
                 | SwappedOrder
                 | UnevenPatterns

@@ -119,9 +119,8 @@ pub fn judge(
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
         judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
-        let places = [FindingCode::TurnedMasks, FindingCode::ShiftedMasks];
         if let Some(dispersion) = dispersion
-            && !judged.iter().any(|finding| places.contains(&finding.code))
+            && !judged.iter().any(|finding| finding.is(FindingCode::TurnedMasks))
         {
             let fit = block_study((&masks, &snapshots), snapshot)?.finish(dispersion.axis);
             judged.splice(0..0, fit.as_ref().and_then(judge_blocks));
