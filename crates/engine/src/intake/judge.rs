@@ -120,7 +120,7 @@ pub fn judge(
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
         judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
         if let Some(dispersion) = dispersion
-            && !judged.iter().any(|finding| finding.is(FindingCode::TurnedMasks))
+            && !judged.iter().any(|finding| finding.code == FindingCode::TurnedMasks)
         {
             let fit = block_study((&masks, &snapshots), snapshot)?.finish(dispersion.axis);
             judged.splice(0..0, fit.as_ref().and_then(judge_blocks));
