@@ -134,7 +134,8 @@ mod tests {
 
     use super::{LeastRate, WriteDeadline};
 
-    const SECOND: LeastRate = LeastRate { bytes: 10_000, time: Duration::from_secs(1) };
+    /// Far below the rates of the fast clients, which a busy machine slows down.
+    const SECOND: LeastRate = LeastRate { bytes: 2_000, time: Duration::from_secs(1) };
 
     /// Sends 60,000 bytes to a client that reads `bytes` every 50 ms.
     async fn send_to_client(bytes: usize, least: LeastRate) -> (std::io::Result<()>, Duration) {
@@ -156,7 +157,7 @@ mod tests {
     async fn an_answer_to_a_slow_client_is_aborted() {
         let (sent, took) = send_to_client(50, SECOND).await;
         assert_eq!(sent.unwrap_err().kind(), ErrorKind::TimedOut);
-        assert!((1.0..2.0).contains(&took.as_secs_f64()), "{took:?}");
+        assert!((1.0..5.0).contains(&took.as_secs_f64()), "{took:?}");
         let (sent, took) = send_to_client(1000, SECOND).await;
         sent.unwrap();
         assert!(took > 2 * SECOND.time, "several periods passed: {took:?}");
