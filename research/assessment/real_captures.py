@@ -3,11 +3,11 @@
     python real_captures.py SCI_RECON_BINARY --data FOLDER [--algorithm NAME] [--capture NAME...] [--rows N] [--keep FOLDER]
 
 FOLDER has the published files that CAPTURES lists. There is no truth. The judge is the program: it must find an error in
-wrong masks, and none in the right ones; a shift along the dispersion counts as neither. A second judge is the hold-out error: 5 % of the sensor's pixels are declared bad,
-and the frames predict them through the masks. The error is relative to that of the mean of the eight pixels around each;
-`worse_by` is the mean difference of the squared errors to those behind the right masks, in standard errors. Each row is
-printed as a JSON object; the last row of a capture is a summary. The status is 1 if the program misses wrong masks or
-refuses the right ones.
+wrong masks, and none in the right ones; a shift along the dispersion counts as neither. A second judge is the hold-out
+error: 5 % of the sensor's pixels are declared bad, and the frames predict them through the masks. The error is relative to
+that of the mean of the eight pixels around each; `worse_by` is the mean difference of the squared errors to those behind
+the right masks, in standard errors. Each row is printed as a JSON object; the last row of a capture is a summary. The
+status is 1 if the program misses wrong masks or refuses the right ones.
 """
 import argparse
 import json
