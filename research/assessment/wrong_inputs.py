@@ -5,11 +5,11 @@
     python wrong_inputs.py report --out FOLDER [--markdown] [--write WRONG_INPUTS.md]
 
 DATA has photographs in photos/train and photos/val. A camera moves over them by at most 4 pixels per frame, behind
-masks of every kind, Cr 6 to 24, with noise of 0 to 10 and given dark frames. Clips in clips/train and clips/val, folders
-of frames, test for false alarms in real motion. `run` gives each kind of input of each scene to `sci-recon reconstruct`, which runs the checks of the service, and appends the results to a file in FOLDER for
-this binary: an interrupted run continues where it stopped. `report` reads the newest file. It counts, for each kind,
-how many inputs are flagged at all, and for how many the first finding names the cause. The last line of a report is
-JSON.
+masks of every kind, Cr 6 to 24, with noise of 0 to 10 and given dark frames. Clips in clips/train and clips/val,
+folders of frames, test for false alarms in real motion. `run` gives each kind of input of each scene to `sci-recon
+reconstruct`, which runs the checks of the service, and appends the results to a file in FOLDER for this binary: an
+interrupted run continues where it stopped. `report` reads the newest file. It counts, for each kind, how many inputs
+are flagged at all, and for how many the first finding names the cause. The last line of a report is JSON.
 """
 import argparse
 import concurrent.futures

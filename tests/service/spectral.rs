@@ -224,6 +224,24 @@ async fn fractions_rows_and_masks_of_the_measurement_are_reconstructed() {
     }
 }
 
+/// Masks that are displaced along the dispersion fit narrow spectra better, and a line has the light of one mask.
+#[tokio::test]
+async fn narrow_spectra_are_no_sign_of_wrong_masks() {
+    let app = TestApp::start().await;
+    for width in [0.2_f32, 0.9, 2.0] {
+        let scene = |band: usize, row: usize, column: usize| {
+            let texture = 0.5 + 0.2 * ((row as f32 / 7.0).sin() + (column as f32 / 11.0).cos());
+            texture * (-((band as f32 - 4.0) / width).powi(2)).exp()
+        };
+        let lab = Lab::of(160, scene, "column", "0:1:8", "scene");
+        let calibration = id(&lab.calibrate(&app).await.expect(201));
+        let created = app.measure(&calibration, lab.file("measurement.npy")).await.expect(201);
+        let warnings = &created.json()["warnings"];
+        let all = warnings.as_array().unwrap();
+        assert!(all.iter().all(|warning| warning["severity"] != "error"), "{width}: {warnings:#}");
+    }
+}
+
 #[tokio::test]
 async fn wrong_masks_of_a_dark_scene_are_errors() {
     /// The pixel of the right mask at each pixel of another one.

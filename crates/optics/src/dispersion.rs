@@ -275,40 +275,22 @@ impl Dispersion {
         })
     }
 
-    /// True if a finding can be right about a spectral camera. It has one mask for all bands, so findings that compare
-    /// separate masks or look for motion do not apply, and a spectral line has the light of one mask. Shifts are
-    /// found block by block. The colour of a scene varies from place to place, which looks like an
-    /// offset that the masks do not explain, and like missing modulation.
+    /// True if a finding on masks can be right about those of a spectral camera. It has one mask for all bands, so findings
+    /// that compare separate masks do not apply.
     pub fn admits(code: FindingCode) -> bool {
         use FindingCode::{
-            BinaryMeasurement, DeadPixels, DriftedMasks, ExchangedMasks, FastMotion, ForeignMasks,
-            MaskValues, MissingMask, MissingPattern, NegativeOffset, NoDark, OneDimensional,
-            PartlyMovedMasks, RepeatedPattern, ResampledMasks, ShiftedMasks, StuckPixels,
-            SwappedOrder, UnevenPatterns, UnmodulatedArea, WrongDark,
+            DeadPixels, MissingPattern, OneDimensional, RepeatedPattern, StuckPixels, SwappedOrder,
+            UnevenPatterns,
         };
         !matches!(
             code,
-            BinaryMeasurement
-                | DeadPixels
-                | DriftedMasks
-                | ExchangedMasks
-                | FastMotion
-                | ForeignMasks
-                | MaskValues
-                | MissingMask
+            DeadPixels
                 | MissingPattern
-                | NegativeOffset
-                | NoDark
                 | OneDimensional
-                | PartlyMovedMasks
                 | RepeatedPattern
-                | ResampledMasks
-                | ShiftedMasks
                 | StuckPixels
                 | SwappedOrder
                 | UnevenPatterns
-                | UnmodulatedArea
-                | WrongDark
         )
     }
 

@@ -48,8 +48,8 @@ pub use lens::soften;
 pub use mask_values::Alteration;
 pub use masks::{HybridAperture, Normalisation, ProjectedMasks};
 pub use measurement_check::{
-    BitUsage, MeasurementFigures, MeasurementStudy, PhaseDifference, REACH, judge_measurement,
-    with_means,
+    BitUsage, MeasurementFigures, MeasurementStudy, PhaseDifference, REACH, judge_dispersed,
+    judge_measurement, with_means,
 };
 pub use mosaic::{MARGIN, Mosaic};
 pub use multiplex::{Draw, Multiplexing};

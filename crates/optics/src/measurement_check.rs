@@ -614,10 +614,23 @@ impl BitUsage {
     }
 }
 
-/// Checks a measurement. `dark_subtracted` is true if dark frames were subtracted.
-pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) -> Vec<Finding> {
+/// Checks a measurement of a spectral camera, which has one mask for all bands: its scale, its sign and its sensor.
+/// [`judge_blocks`](super::judge_blocks) tests the masks. `dark_subtracted` is true if dark frames were subtracted.
+///
+/// The colour of a scene varies from place to place. This looks like an offset that the masks do not explain, and like
+/// missing modulation. A spectral line has the light of one mask.
+pub fn judge_dispersed(figures: &MeasurementFigures, dark_subtracted: bool) -> Vec<Finding> {
+    let mut findings = scale_and_sign(figures, dark_subtracted);
+    if !figures.is_uncertain {
+        findings.extend(inverted_masks(figures).or_else(|| mosaic(figures)));
+    }
+    findings.extend(implausible_brightness(figures));
+    findings
+}
+
+/// Findings that need no fit.
+fn scale_and_sign(figures: &MeasurementFigures, dark_subtracted: bool) -> Vec<Finding> {
     let mut findings: Vec<Finding> = mask_scale(figures.largest_mask).into_iter().collect();
-    let has_mask_scale = !findings.is_empty();
     let negative = figures.negative_area;
     if negative > 0.01 {
         let cause = if dark_subtracted {
@@ -631,6 +644,12 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
         );
         findings.push(Finding::new(FindingCode::Negative, detail).escalate_if(negative > 0.1));
     }
+    findings
+}
+
+/// Checks a measurement. `dark_subtracted` is true if dark frames were subtracted.
+pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) -> Vec<Finding> {
+    let mut findings = scale_and_sign(figures, dark_subtracted);
     // Without a correct fit the other figures are meaningless, so the checks end at the first of these.
     let wrong = copy_of_a_mask(figures)
         .or_else(|| inverted_masks(figures))
@@ -640,27 +659,18 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
     let wrong = wrong.filter(|_| !figures.is_uncertain);
     // The other figures need the mean brightness of the frames.
     if wrong.is_none() && (figures.is_uncertain || figures.fits_locally()) {
-        if !has_mask_scale {
-            findings.extend(implausible_brightness(figures));
-        }
+        findings.extend(implausible_brightness(figures));
         return findings;
     }
     if let Some(finding) = wrong.or_else(|| foreign_masks(figures)) {
         findings.push(finding);
         // Without a fit, all light counts as light of the scene.
-        if figures.is_flat && !has_mask_scale {
+        if figures.is_flat {
             findings.extend(implausible_brightness(figures));
         }
         return findings;
     }
-    if let Some(amplitude) = mosaic_amplitude(figures) {
-        let detail = format!(
-            "pixels of alternate rows and columns differ by {:.0} % of the mean: this looks like the raw mosaic of a \
-             colour sensor, but the calibration is for a grey one",
-            amplitude * 100.0
-        );
-        findings.push(Finding::new(FindingCode::Mosaic, detail));
-    }
+    findings.extend(mosaic(figures));
     // Masks between two pixels, and altered masks, explain the light badly, which looks like an offset and like missing
     // light. The curve of sRGB makes binary masks sharper after a drift, so the drift comes first.
     match drifted_masks(figures).or_else(|| altered_masks(figures)) {
@@ -674,9 +684,7 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
             findings.extend(unexplained_light(figures, dark_subtracted));
         }
     }
-    if !has_mask_scale {
-        findings.extend(implausible_brightness(figures));
-    }
+    findings.extend(implausible_brightness(figures));
     findings
 }
 
@@ -773,14 +781,21 @@ fn partly_moved_masks(figures: &MeasurementFigures) -> Option<Finding> {
     Some(Finding::new(FindingCode::PartlyMovedMasks, detail))
 }
 
-/// Amplitude of the differences between the colours of a mosaic, if the measurement looks like one.
-fn mosaic_amplitude(figures: &MeasurementFigures) -> Option<f64> {
+/// A measurement that looks like the mosaic of a colour sensor.
+fn mosaic(figures: &MeasurementFigures) -> Option<Finding> {
     let global = (figures.mosaic, MOSAIC_AMPLITUDE, MOSAIC_SIGNIFICANCE);
     let local = (figures.local_mosaic, LOCAL_MOSAIC_AMPLITUDE, LOCAL_MOSAIC_SIGNIFICANCE);
     let found = [global, local].into_iter().find(|(difference, amplitude, significance)| {
         difference.amplitude > *amplitude && difference.significance > *significance
     });
-    found.map(|(difference, ..)| difference.amplitude)
+    found.map(|(difference, ..)| {
+        let detail = format!(
+            "pixels of alternate rows and columns differ by {:.0} % of the mean: this looks like the raw mosaic of a \
+             colour sensor, but the calibration is for a grey one",
+            difference.amplitude * 100.0
+        );
+        Finding::new(FindingCode::Mosaic, detail)
+    })
 }
 
 /// A mask that was sent as the measurement.
@@ -944,8 +959,12 @@ fn unmodulated_area(figures: &MeasurementFigures) -> Option<Finding> {
     Some(Finding::new(FindingCode::UnmodulatedArea, detail))
 }
 
-/// A brightness that does not fit the full scale. A dark scene may have one small bright object.
+/// A brightness that does not fit the full scale. A dark scene may have one small bright object. Masks on a wrong scale
+/// change the brightness, too.
 fn implausible_brightness(figures: &MeasurementFigures) -> Option<Finding> {
+    if mask_scale(figures.largest_mask).is_some() {
+        return None;
+    }
     let too_bright = figures.brightest > *PLAUSIBLE_BRIGHTNESS.end();
     let too_dark = figures.brightest_block < *PLAUSIBLE_BRIGHTNESS.start();
     (too_bright || too_dark).then(|| {

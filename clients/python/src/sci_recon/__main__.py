@@ -143,5 +143,5 @@ if __name__ == "__main__":
         sys.exit(main())
     except KeyboardInterrupt:
         pass
-    except SciReconError as error:
+    except (SciReconError, OSError) as error:
         sys.exit(f"sci_recon: {error}")

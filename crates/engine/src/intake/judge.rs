@@ -10,7 +10,8 @@ use formats::planar::Reader;
 use formats::{FormatError, Limits};
 use optics::{
     BLOCK_MARGIN, BlockStudy, Displacement, Magnified, MeasurementFigures, MeasurementStudy, REACH,
-    central, displacement, judge_blocks, judge_measurement, magnification, magnified, with_means,
+    central, displacement, judge_blocks, judge_dispersed, judge_measurement, magnification,
+    magnified, with_means,
 };
 
 /// Side of a checked window without its margin, in pixels.
@@ -94,14 +95,14 @@ pub fn judge(
         let snapshot = sample * count / count.min(SNAPSHOTS);
         let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
         let Some(mut figures) = studied.finish() else { continue };
-        if dispersion.is_some() {
-            (figures.distortion, figures.moved_parts, figures.alteration) = (None, None, None);
-        }
         if let Some(part) = figures.unmodulated.as_mut().filter(|_| mosaic.is_some()) {
             part.place = part.place.map(|at| 2 * at);
         }
         let number = u32::try_from(snapshot).ok();
-        let mut judged = judge_measurement(&figures, dark_subtracted);
+        let mut judged = match dispersion {
+            Some(_) => judge_dispersed(&figures, dark_subtracted),
+            None => judge_measurement(&figures, dark_subtracted),
+        };
         let explained =
             [FindingCode::InvertedMasks, FindingCode::ResampledMasks, FindingCode::ShiftedMasks];
         // Masks at another place explain some of the light by chance, above all in small pictures.
@@ -110,7 +111,8 @@ pub fn judge(
             && figures.explained_unshifted < MIN_EXPLAINED
             && !judged.iter().any(|finding| explained.contains(&finding.code))
             && let Some(misplaced) = misplaced_masks((&masks, &snapshots), snapshot, &figures)?
-            && (dispersion.is_none() || Dispersion::admits(misplaced.code))
+            // Blocks show the other places of the masks of a spectral camera.
+            && (dispersion.is_none() || misplaced.code == FindingCode::TurnedMasks)
         {
             let places = [FindingCode::DriftedMasks, FindingCode::ForeignMasks];
             judged.retain(|finding| !places.contains(&finding.code));
@@ -118,7 +120,6 @@ pub fn judge(
         }
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
-        judged.retain(|finding| dispersion.is_none() || Dispersion::admits(finding.code));
         if let Some(dispersion) = dispersion
             && !judged.iter().any(|finding| finding.code == FindingCode::TurnedMasks)
         {
@@ -401,7 +402,7 @@ fn study(
     Ok(study)
 }
 
-/// Side of a window of blocks without its margin, in pixels, and number of these windows along each side.
+/// Side of a window of blocks without its margin, in pixels, and largest number of these windows along each side.
 const BLOCK_WINDOW: usize = 256;
 const BLOCK_WINDOWS: usize = 3;
 
@@ -414,13 +415,11 @@ fn block_study(
     let windows = |length: usize| {
         let inner = length.saturating_sub(2 * BLOCK_MARGIN);
         let count = inner.div_ceil(BLOCK_WINDOW).clamp(1, BLOCK_WINDOWS);
-        let side = inner.div_ceil(count).min(BLOCK_WINDOW);
-        let start = move |index: usize| match count {
-            1 => 0,
-            _ => index * (inner - side) / (count - 1),
-        };
-        (0..count)
-            .map(move |index| start(index)..(start(index) + side + 2 * BLOCK_MARGIN).min(length))
+        spread(
+            length,
+            (inner.div_ceil(count).min(BLOCK_WINDOW) + 2 * BLOCK_MARGIN).min(length),
+            count,
+        )
     };
     let mut study = BlockStudy::default();
     for rows in windows(height) {
@@ -433,14 +432,17 @@ fn block_study(
     Ok(study)
 }
 
-/// Windows with their margins along one side. All start at even pixels. A short side has one window.
+/// Windows with their margins along one side. A short side has one window.
 fn windows(length: usize) -> Vec<Range<usize>> {
     let side = WINDOW + 2 * REACH;
     let count = (length / side).clamp(1, WINDOWS);
-    let side = if count == 1 { length.min(2 * side) } else { side };
+    spread(length, if count == 1 { length.min(2 * side) } else { side }, count)
+}
+
+/// Ranges of `side` pixels that are spread evenly over a length. They start at even pixels, which keeps the phases of a mosaic.
+fn spread(length: usize, side: usize, count: usize) -> Vec<Range<usize>> {
     let start = |index: usize| match count {
         1 => ((length - side) / 2) & !1,
-        // Even starts keep the phases of a mosaic.
         _ => (index * (length - side) / (count - 1)) & !1,
     };
     (0..count).map(|index| start(index)..start(index) + side).collect()
