@@ -1,6 +1,6 @@
 //! `sci-recon backup`: copies a data folder consistently.
 
-use std::path::PathBuf;
+use std::path::{PathBuf, absolute};
 
 use clap::Args;
 
@@ -28,6 +28,13 @@ pub struct Arguments {
 pub fn run(arguments: &Arguments) -> Result<()> {
     if arguments.out.exists() {
         let text = format!("{} already exists; choose a new folder", arguments.out.display());
+        return Err(CliError::Input(text));
+    }
+    let folder = absolute(&arguments.out).ok().and_then(|out| out.parent()?.canonicalize().ok());
+    let data = arguments.data.canonicalize().ok();
+    if folder.zip(data).is_some_and(|(folder, data)| folder.starts_with(data)) {
+        let text =
+            format!("{} is inside the data folder; choose another place", arguments.out.display());
         return Err(CliError::Input(text));
     }
     let act = async |store: &Store| Ok(store.backup(&arguments.out).await?);

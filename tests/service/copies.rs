@@ -204,6 +204,11 @@ async fn backup_and_verify_name_missing_files() {
     let (good, found) = back_up("whole");
     assert!(good && found["missing"] == json!([]), "{found}");
     assert!(verify(&folder.path().join("whole")).0);
+    let inside =
+        command("backup", app.data()).arg("--out").arg(app.data().join("blobs/copy")).output();
+    let inside = inside.unwrap();
+    let text = String::from_utf8_lossy(&inside.stderr);
+    assert!(inside.status.code() == Some(2) && text.contains("inside the data folder"), "{text}");
     let blob = format!("blobs/{}/{}", &masks[..2], &masks[2..]);
     std::fs::remove_file(app.data().join(&blob)).unwrap();
     std::fs::remove_file(frames_of(&app, &job)).unwrap();

@@ -43,7 +43,7 @@ async fn send(app: &TestApp, count: usize, seed: &str) {
 fn refused(data: &Path, sentence: &str) {
     let before = files(data);
     let serve = ["serve", "--listen", "127.0.0.1:0", "--workers", "0", "--min-free-bytes", "0"];
-    let copy = data.join("copy").display().to_string();
+    let copy = data.with_extension("copy").display().to_string();
     for arguments in [
         &serve[..],
         &["worker"],

@@ -292,6 +292,33 @@ async fn wrong_masks_of_a_dark_scene_are_errors() {
     }
 }
 
+/// Two small discs on black show no masks, neither right nor wrong ones.
+#[tokio::test]
+async fn a_scene_that_does_not_show_its_masks_is_no_good_result() {
+    let spots = |band: usize, row: usize, column: usize| {
+        let disc = |i: f32, j: f32, colour: f32| {
+            let inside = (row as f32 - i).hypot(column as f32 - j) < 5.0;
+            if inside { 0.8 * (-((band as f32 - colour) / 2.5).powi(2)).exp() } else { 0.0 }
+        };
+        disc(50.0, 70.0, 1.0) + disc(84.0, 40.0, 4.0)
+    };
+    let lab = Lab::of(128, spots, "column", "0:2:8", "scene");
+    let app = TestApp::with(&["--workers", "1"]).await;
+    let mask = values(&lab.file("masks.npy"));
+    for is_flipped in [false, true] {
+        let value = |at: usize| mask[if is_flipped { mask.len() - 1 - at } else { at }];
+        let masks = app.upload(npy(&[1, 128, 128], (0..mask.len()).map(value))).await;
+        let body = json!({"masks": masks, "dispersion": lab.dispersion});
+        let calibration = id(&app.post("/v1/calibrations", &body).await.expect(201));
+        let created = app.measure(&calibration, lab.file("measurement.npy")).await.expect(201);
+        assert_eq!(created.json()["warnings"][0]["code"], "unverified_masks", "{is_flipped}");
+        let body = json!({"measurement": id(&created), "algorithm": "gap-tv"});
+        let ended = app.ended(&app.submit(&body).await).await;
+        let assessment = &ended["assessment"];
+        assert_ne!(assessment["grade"], "good", "{is_flipped}: {assessment:#}");
+    }
+}
+
 #[tokio::test]
 async fn a_dispersion_that_does_not_fit_is_refused_with_the_expected_size() {
     let lab = Lab::new("column", "0:2:8", "scene");

@@ -224,6 +224,10 @@ findings! {
     ForeignMasks: [Measurement], [Error],
         "the masks do not explain the measurement",
         "name the calibration that belongs to this measurement, or calibrate again";
+    UnverifiedMasks: [Measurement], [Warning],
+        "the measurement does not show whether the masks belong to it",
+        "compare the frames with what you know of the scene; a measurement of a bright scene that fills the picture, with \
+         the same optics, shows whether the calibration is right";
     InvertedMasks: [Measurement], [Error],
         "the masks are inverted: open pixels are 0, closed ones 1",
         "create a new calibration with 1 - C as the masks";

@@ -120,11 +120,12 @@ pub fn judge(
         }
         // The user has stated the mosaic.
         judged.retain(|finding| mosaic.is_none() || finding.code != FindingCode::Mosaic);
+        let named = [FindingCode::TurnedMasks, FindingCode::InvertedMasks];
         if let Some(dispersion) = dispersion
-            && !judged.iter().any(|finding| finding.code == FindingCode::TurnedMasks)
+            && !judged.iter().any(|finding| named.contains(&finding.code))
         {
             let fit = block_study((&masks, &snapshots), snapshot)?.finish(dispersion.axis);
-            judged.splice(0..0, fit.as_ref().and_then(judge_blocks));
+            judged.splice(0..0, judge_blocks(fit.as_ref()));
         }
         let judged = judged.into_iter();
         findings
