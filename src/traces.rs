@@ -45,7 +45,7 @@ pub(crate) fn finish() {
 }
 
 /// Makes a span continue the trace of a caller.
-pub(crate) fn go_on(span: &Span, (trace, parent): (&str, &str), is_sampled: bool) {
+pub(crate) fn go_on(span: &Span, trace: &str, parent: &str, is_sampled: bool) {
     let (Ok(trace), Ok(parent)) = (TraceId::from_hex(trace), SpanId::from_hex(parent)) else {
         return;
     };

@@ -95,7 +95,7 @@ async fn notify(
     let job = store.job_of_any_lab(job).await?;
     let Some(webhook) = &job.spec.webhook else { return store.notified(id).await };
     let secret = store.webhook_secret(&job.lab, false).await?;
-    let failure = match post(client, allowed, webhook, (id, &job, &secret)).await {
+    let failure = match post(client, allowed, webhook, id, &job, &secret).await {
         Ok(()) => {
             tracing::info!(job = %job.id, host = %webhook.place(), "the webhook was notified");
             return store.notified(id).await;
@@ -123,7 +123,9 @@ async fn post(
     client: &Client,
     allowed: &[String],
     webhook: &Webhook,
-    (id, job, secret): (i64, &Job, &[u8]),
+    id: i64,
+    job: &Job,
+    secret: &[u8],
 ) -> Result<(), Failure> {
     if !webhook.is_allowed(allowed) {
         let reason = format!("the administrator does not allow the host {}", webhook.place());

@@ -100,7 +100,7 @@ async fn act(store: &Store, log: &AuditLog, action: &Action) -> Result<String> {
         }
         Action::Delete { ref jobs, ref lab, ref state, yes, .. } => {
             return match lab {
-                Some(lab) => delete_all(store, log, (lab, state), yes).await,
+                Some(lab) => delete_all(store, log, lab, state, yes).await,
                 None => delete_each(store, log, jobs).await,
             };
         }
@@ -132,7 +132,8 @@ async fn delete_each(store: &Store, log: &AuditLog, jobs: &[JobId]) -> Result<St
 async fn delete_all(
     store: &Store,
     log: &AuditLog,
-    (lab, states): (&Lab, &[JobState]),
+    lab: &Lab,
+    states: &[JobState],
     yes: bool,
 ) -> Result<String> {
     if let Some(state) = states.iter().find(|state| !state.is_final()) {

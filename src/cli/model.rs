@@ -37,8 +37,10 @@ impl Model {
 /// Decides how snapshots of frames x rows x columns are cut. The user's values precede the defaults of the algorithm and
 /// the network.
 pub fn cut(
-    (algorithm, schedule): (Algorithm, &Schedule),
-    (tile, overlap): (Option<usize>, Option<usize>),
+    algorithm: Algorithm,
+    schedule: &Schedule,
+    tile: Option<usize>,
+    overlap: Option<usize>,
     model: Option<&Model>,
     sequence: (Sequence, u32),
     dim: (usize, usize, usize),

@@ -163,8 +163,10 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let (height, width) = shape.solved();
     let dim = (shape.frames, height, width);
     let cut = cut(
-        (algorithm, &schedule),
-        (arguments.tile, arguments.overlap),
+        algorithm,
+        &schedule,
+        arguments.tile,
+        arguments.overlap,
         model.as_ref(),
         (input.sequence(arguments.sequence), snapshots.len() as u32),
         dim,
@@ -226,7 +228,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let mut histogram = Histogram::default();
     (0..frames * snapshots.len()).for_each(|index| histogram.add(&frame(index)));
     let white_level = white_level(&histogram, white);
-    let recipe = input.recipe(&setup, (white, white_level), &solved, arguments)?;
+    let recipe = input.recipe(&setup, white, white_level, &solved, arguments)?;
     let expected = |snapshot| {
         let assessments = solved.assessments(&sequence, snapshot, &recipe.schedule);
         // The quality model is fitted to the embedded networks.
@@ -513,7 +515,8 @@ impl<'a> Input<'a> {
     fn recipe(
         &self,
         setup: &Setup,
-        (normalisation, white_level): (f32, f32),
+        normalisation: f32,
+        white_level: f32,
         solved: &Solved,
         arguments: &Arguments,
     ) -> Result<Recipe> {

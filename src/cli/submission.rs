@@ -300,7 +300,8 @@ impl Recipe {
     pub(super) async fn submit(
         &self,
         client: &Client,
-        (file, data): (&Path, Sha256),
+        file: &Path,
+        data: Sha256,
         label: Option<&str>,
         key: &str,
     ) -> Result<Value> {

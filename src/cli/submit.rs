@@ -71,5 +71,5 @@ async fn submit(client: &Client, arguments: &Arguments, key: &str) -> Result<Val
     };
     let recipe = submission.recipe(client).await?;
     let data = client.upload_with_bar(file).await?;
-    Ok(recipe.submit(client, (file, data), None, key).await?)
+    Ok(recipe.submit(client, file, data, None, key).await?)
 }

@@ -180,7 +180,7 @@ pub(super) async fn guard(
     next: Next,
 ) -> Response {
     let Some(role) = rule.role(request.method()) else { return next.run(request).await };
-    match admit((&store, &sites), (rule, role), &mut request).await {
+    match admit(&store, &sites, rule, role, &mut request).await {
         Ok(access) => {
             Admitted::of(&request).set(&access);
             tracing::Span::current().record("lab", access.lab.as_str());
@@ -211,8 +211,10 @@ pub(super) async fn guard(
 }
 
 async fn admit(
-    (store, sites): (&Store, &Sites),
-    (rule, role): (Rule, Role),
+    store: &Store,
+    sites: &Sites,
+    rule: Rule,
+    role: Role,
     request: &mut Request,
 ) -> Result<Access> {
     let (method, headers) = (request.method(), request.headers());
@@ -235,7 +237,7 @@ async fn admit(
         }
         if shown.is_some() || headers.contains_key(header::AUTHORIZATION) {
             let client = request.extensions().get::<Client>().copied();
-            sites.sign_ins.failed(client, (method, request.uri().path(), headers))?;
+            sites.sign_ins.failed(client, method, request.uri().path(), headers)?;
         }
         return Err(missing());
     };

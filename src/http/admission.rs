@@ -125,7 +125,8 @@ impl Admission {
     pub(super) async fn with_room<T>(
         &self,
         lab: &Lab,
-        (what, needed): (&'static str, u64),
+        what: &'static str,
+        needed: u64,
         accept: impl Future<Output = Result<T, StoreError>>,
     ) -> Result<T> {
         let _gate = self.gate.lock().await;

@@ -147,7 +147,7 @@ pub(super) async fn list(
 ) -> Result<Response> {
     let created = Span { from: query.created_after, before: query.created_before };
     let after = query.cursor.map(|Cursor(id)| id);
-    page(caller, (query.limit, Filter { calibration: None, created, after }), &request).await
+    page(caller, query.limit, Filter { calibration: None, created, after }, &request).await
 }
 
 /// `GET /v1/calibrations/{calibration}/masks`: the masks on \[0,1\] as npy. Bad pixels are NaN.

@@ -49,7 +49,7 @@ impl Download {
         if let Some(known) = conditional::not_modified(headers, &etag, tag)? {
             return Ok(known);
         }
-        let (status, start, length) = self.portion(&etag, (method, headers))?;
+        let (status, start, length) = self.portion(&etag, method, headers)?;
         let mut response = (status, read(start, length).await?).into_response();
         let fields = response.headers_mut();
         fields.insert(header::CONTENT_TYPE, HeaderValue::from_static(self.kind));
@@ -69,7 +69,8 @@ impl Download {
     fn portion(
         &self,
         etag: &str,
-        (method, headers): (&Method, &HeaderMap),
+        method: &Method,
+        headers: &HeaderMap,
     ) -> Result<(StatusCode, u64, u64)> {
         let whole = (StatusCode::OK, 0, self.size);
         if !self.accepts_ranges {

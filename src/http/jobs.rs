@@ -326,7 +326,7 @@ async fn insert(
     let lab = access.lab.clone();
     let (most_jobs, needed) = (app.settings.max_jobs, spec.disk_bytes());
     let new = NewJob { most_jobs, lab, spec, key };
-    let place = app.admission.with_room(&access.lab, ("the job", needed), app.store.add_job(new));
+    let place = app.admission.with_room(&access.lab, "the job", needed, app.store.add_job(new));
     match place.await {
         Err(full) if full.code() == Code::QueueFull => Err(full.retry_after(next_end(app).await?)),
         inserted => inserted,

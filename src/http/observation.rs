@@ -37,7 +37,7 @@ pub(super) fn span(request: &Request) -> Span {
     {
         span.record("trace_id", trace).record("parent_id", parent);
         #[cfg(feature = "otel")]
-        crate::traces::go_on(&span, (trace, parent), _is_sampled);
+        crate::traces::go_on(&span, trace, parent, _is_sampled);
     }
     span
 }

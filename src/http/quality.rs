@@ -59,8 +59,8 @@ pub(super) async fn show(
         let upload = intake::upload(&app, truth).await.map_err(|error| error.at("/truth"))?;
         let (shape, limits) = (job.spec.frame_shape(), app.limits);
         let frames = intake::run(&app, &access.lab, move || {
-            let (truth, channels) = open(&upload, (full_scale, axes), limits, shape)?;
-            compare((&path, channels), truth, snapshot as usize, shape)
+            let (truth, channels) = open(&upload, full_scale, axes, limits, shape)?;
+            compare(&path, channels, truth, snapshot as usize, shape)
         });
         Ok::<_, ApiError>(frames.await?.into())
     };
@@ -73,7 +73,8 @@ pub(super) async fn show(
 /// Compares the frames of a snapshot with true frames, of this snapshot or of all snapshots of the measurement. Memory holds
 /// one frame of each.
 fn compare(
-    (path, channels): (&Path, Channels),
+    path: &Path,
+    channels: Channels,
     mut truth: Opened,
     snapshot: usize,
     shape: SceneShape,

@@ -34,7 +34,9 @@ impl SignIns {
     pub(super) fn failed(
         &self,
         client: Option<Client>,
-        (method, path, headers): (&Method, &str, &HeaderMap),
+        method: &Method,
+        path: &str,
+        headers: &HeaderMap,
     ) -> Result<(), ApiError> {
         let network = client.map(|client| Client::network(client.address));
         let rate = network.and_then(|network| self.rates.take(network, Instant::now()));

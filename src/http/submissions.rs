@@ -72,13 +72,14 @@ pub(super) async fn list<Id: ResourceApi>(
     QueryOf(query): QueryOf<ListQuery<Id>>,
     request: RequestContext,
 ) -> Result<Response> {
-    page(caller, (query.limit, query.filter()), &request).await
+    page(caller, query.limit, query.filter(), &request).await
 }
 
 /// A page of a list.
 pub(super) async fn page<Id: ResourceApi>(
     Caller(app, access): Caller,
-    (limit, filter): (Limit, Filter<Id>),
+    limit: Limit,
+    filter: Filter<Id>,
     request: &RequestContext,
 ) -> Result<Response> {
     let Page { items, more } = app.store.resources(&access.lab, filter, limit.get()).await?;

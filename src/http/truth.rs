@@ -21,7 +21,7 @@ pub(super) async fn check(app: &App, lab: &Lab, truth: Sha256, shape: SceneShape
     let upload = intake::upload(app, truth).await.map_err(|error| error.at("/truth"))?;
     let limits = app.limits;
     let read = intake::run(app, lab, move || {
-        let (mut truth, _) = open(&upload, (None, None), limits, shape)?;
+        let (mut truth, _) = open(&upload, None, None, limits, shape)?;
         (0..truth.info.frames).try_for_each(|frame| next_frame(&mut truth, frame).map(drop))
     });
     read.await.map_err(|error| error.at("/truth"))
@@ -48,7 +48,8 @@ pub(super) fn next_frame(truth: &mut Opened, frame: usize) -> Result<Array2<f32>
 /// Errors: those of the file; [`IntakeError::Size`] for other frames than those of the job.
 pub(super) fn open(
     path: &Path,
-    (full_scale, axes): (Option<f32>, Option<Axes>),
+    full_scale: Option<f32>,
+    axes: Option<Axes>,
     limits: Limits,
     shape: SceneShape,
 ) -> Result<(Opened, Channels), IntakeError> {

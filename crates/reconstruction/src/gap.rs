@@ -37,7 +37,8 @@ use super::state::State;
 /// A network fails, the frames are no longer finite, or [`ReconError::Cancelled`] if the observer asks for it.
 pub(crate) fn run_stage(
     solver: &mut Solver<'_>,
-    (index, stage): (usize, &Stage),
+    index: usize,
+    stage: &Stage,
     observer: &mut dyn Observer,
     mut after: impl FnMut(&State) -> Result<ControlFlow<()>>,
 ) -> Result<bool> {

@@ -44,7 +44,8 @@ pub const ITERATION_DIVISOR: usize = 3;
 /// As [`solver::reconstruct`].
 pub fn compare(
     op: &SensingOperator,
-    (first, y): (usize, ArrayView3<'_, f32>),
+    first: usize,
+    y: ArrayView3<'_, f32>,
     joints: &[usize],
     schedule: &Schedule,
     networks: &mut dyn Networks,
@@ -108,7 +109,7 @@ mod tests {
         let y = stack(Axis(0), &[before.view(), next.view()]).unwrap();
         let op = SensingOperator::new(masks.clone()).unwrap();
         let schedule = Schedule { adaptive: false, ..Schedule::gap_tv3d() };
-        compare(&op, (5, y.view()), &[5], &schedule, &mut (), &mut ()).unwrap()[0]
+        compare(&op, 5, y.view(), &[5], &schedule, &mut (), &mut ()).unwrap()[0]
     }
 
     #[test]

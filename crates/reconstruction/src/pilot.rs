@@ -231,7 +231,7 @@ impl Judge<'_> {
         // A stage with a noise level is judged at its full length.
         let tolerance = if fixed { stage.tolerance } else { 0.0 };
         let run = Stage { tolerance, ..stage.clone() };
-        match run_stage(solver, (index, &run), &mut *self.observer, measure) {
+        match run_stage(solver, index, &run, &mut *self.observer, measure) {
             Err(ReconError::Diverged { .. }) if !fixed => trial.diverged = true,
             other => {
                 other?;

@@ -155,7 +155,7 @@ fn run_once(
     stage: &Stage,
     observer: &mut dyn Observer,
 ) -> Result<bool> {
-    run_stage(solver, (index, stage), observer, |_| Ok(ControlFlow::Continue(())))
+    run_stage(solver, index, stage, observer, |_| Ok(ControlFlow::Continue(())))
 }
 
 /// Runs a stage with weak, and again with strong temporal shrinkage from the same start, and blends the weakly shrunk frames

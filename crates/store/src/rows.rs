@@ -98,7 +98,8 @@ pub(super) async fn require(
 /// the query that counts them as `users`.
 pub(super) async fn refuse_if_used(
     connection: &mut SqliteConnection,
-    (what, id): (&'static str, String),
+    what: &'static str,
+    id: String,
     (by, query): (&'static str, &'static str),
 ) -> Result<()> {
     let users = sql_as!(query, [id]).fetch_one(connection).await?;

@@ -51,9 +51,9 @@ impl Store {
         }
         quota::check_checks(&mut transaction, lab).await?;
         let new = (submission, limits, origin.as_deref());
-        let bytes = requests::insert(&mut transaction, (lab, token), id, new).await?;
+        let bytes = requests::insert(&mut transaction, lab, token, id, new).await?;
         let cost = submission.check_cost(bytes);
-        graph::insert_for(&mut transaction, (lab, id), TaskKind::Check, cost).await?;
+        graph::insert_for(&mut transaction, lab, id, TaskKind::Check, cost).await?;
         keys::insert(&mut transaction, lab, what, key, id).await?;
         transaction.commit().await?;
         Ok(Inserted::New(id.into()))

@@ -54,7 +54,7 @@ pub(super) fn perform(
             let mut white = scale::job_white_level(&arrays, snapshots, monitor)?;
             let job = (&arrays, snapshots);
             let registration =
-                registration::register_stored(job, (registration, is_coloured), white, monitor)?;
+                registration::register_stored(job, registration, is_coloured, white, monitor)?;
             // Behind masks elsewhere, pixels that seem dark have light, and the scene seems too bright.
             if let Some(registered) = registration.as_ref().filter(|it| it.changes_white_level()) {
                 let arrays = Arrays { correction: registered.correction(), ..arrays };

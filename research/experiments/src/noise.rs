@@ -169,8 +169,7 @@ impl Bench<'_> {
     ) -> Result<Vec<f64>, CliError> {
         let clean = measure(masks.view(), clip.frames.view())?;
         let alone = (Sequence::Separate, 1);
-        let gap_tv = (Algorithm::GapTv, &self.schedule);
-        let cut = cut(gap_tv, (None, None), None, alone, masks.dim())?;
+        let cut = cut(Algorithm::GapTv, &self.schedule, None, None, None, alone, masks.dim())?;
         let plan = cut.tiles(masks.dim().1, masks.dim().2)?;
         let mut by_sigma = Vec::with_capacity(self.sigmas.len());
         for &sigma in self.sigmas {

@@ -165,8 +165,7 @@ impl Bench {
             Choice::Runs(_) => Sequence::Separate,
         };
         let count = (kind, snapshots as u32);
-        let mut cut =
-            cut((algorithm, &schedule), (None, None), learned, count, measured.masks.dim())?;
+        let mut cut = cut(algorithm, &schedule, None, None, learned, count, measured.masks.dim())?;
         if let Choice::Runs(run) = sequence {
             cut.run = run;
         }

@@ -63,7 +63,7 @@ impl Client {
             }
         }
         // Another process may have downloaded the beginning. The ETag in the name identifies the file's content.
-        let part = self.bytes(href, &etag, (part(path, &etag), size), bar).await?;
+        let part = self.bytes(href, &etag, part(path, &etag), size, bar).await?;
         if let Some(expected) = sha256.filter(|expected| *expected != part.hashed.sha256()) {
             let text = format!(
                 "{}: the downloaded file has the hash {}, not {expected}",
@@ -88,7 +88,8 @@ impl Client {
         &self,
         href: &str,
         etag: &str,
-        (path, size): (PathBuf, u64),
+        path: PathBuf,
+        size: u64,
         bar: &ProgressBar,
     ) -> Result<Part> {
         let mut part = Part::open(path, size)?;

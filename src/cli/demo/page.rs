@@ -65,7 +65,7 @@ pub(super) fn write(
         let difference = picture(&format!("{name}-difference"), difference.view(), 1.0 / GAIN)?;
         pictures.push((name, picture(name, frame, 1.0)?, Some(difference)));
     }
-    let text = page((middle, &measured), &pictures, reconstructions, report);
+    let text = page(middle, &measured, &pictures, reconstructions, report);
     let path = out.join(PAGE);
     fs::write(&path, text).map_err(|error| unwritable(&path, error))
 }
@@ -74,7 +74,8 @@ pub(super) fn write(
 type Shown<'a> = (&'a str, String, Option<String>);
 
 fn page(
-    (middle, measured): (usize, &str),
+    middle: usize,
+    measured: &str,
     pictures: &[Shown<'_>],
     reconstructions: &[Reconstruction],
     report: &Report,

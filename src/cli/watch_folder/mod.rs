@@ -284,8 +284,7 @@ impl Watch<'_> {
         }
         self.arguments.submission.send_dark(&self.client).await?;
         let label: String = entry.shot.name.chars().take(200).collect();
-        let job =
-            entry.recipe.submit(&self.client, (&path, data), Some(&label), &entry.key).await?;
+        let job = entry.recipe.submit(&self.client, &path, data, Some(&label), &entry.key).await?;
         Ok(Some(Stage::Submitted { job: Job::new(job)?.id }))
     }
 

@@ -66,7 +66,7 @@ pub(in crate::http) async fn create(
     let clip = Clip { app, job, snapshot, format: format.into() };
     check(&clip, format).await?;
     let window = requested_window(&clip.app, id, black, white).await?;
-    let movie = clip.app.store.create_movie(&clip.job, (snapshot, format), &window).await?;
+    let movie = clip.app.store.create_movie(&clip.job, snapshot, format, &window).await?;
     let answer = match movie {
         Movie::Ready { .. } => {
             Json(ExportBody { state: ExportState::Ready, percent: 100.0 }).into_response()

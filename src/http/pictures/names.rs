@@ -277,7 +277,7 @@ async fn true_frame(app: &App, job: &Job, snapshot: u32, k: usize) -> Result<Tru
         .ok_or_else(|| not_found("the job has no true frames; attach them with PATCH".into()))?;
     let (path, limits) = (intake::upload(app, truth).await?, app.limits);
     let (shape, snapshot) = (job.spec.frame_shape(), snapshot as usize);
-    let open = move || truth::open(&path, (None, None), limits, shape);
+    let open = move || truth::open(&path, None, None, limits, shape);
     let opened = tokio::task::spawn_blocking(open).await;
     let (mut opened, channels) = opened.map_err(|error| ApiError::internal(&error))??;
     let index = truth::frames_before(&opened, snapshot, shape) + k;

@@ -149,7 +149,7 @@ pub(super) async fn create(Caller(app, access): Caller, headers: HeaderMap) -> R
     // The reservation is extended while the upload grows.
     let first = length.unwrap_or(FIRST_RESERVE).min(FIRST_RESERVE);
     let insert = app.store.begin_partial(facts, app.settings.upload_age(), key.as_ref());
-    let inserted = app.admission.with_room(&lab, ("the upload", first), insert).await?;
+    let inserted = app.admission.with_room(&lab, "the upload", first, insert).await?;
     created(&app, &lab, inserted.id()).await
 }
 

@@ -81,7 +81,7 @@ pub fn calibrate<W: Write>(
         }
         _ => None,
     };
-    let captured = average_masks((files, bad.as_ref()), limits, scratch, progress)?;
+    let captured = average_masks(files, bad.as_ref(), limits, scratch, progress)?;
     let raw = Reader::open(scratch, limits)?;
     let to = open(raw.info())?;
     let masks = write_scaled(&raw, captured.scale, to, progress)?;
@@ -163,7 +163,8 @@ struct Captured {
 
 /// Averages captures frame by frame without the pixels of a map, and writes the masks \[B,H,W\] before normalisation to `raw`.
 fn average_masks(
-    (files, bad): (&CaptureFiles, Option<&Array2<bool>>),
+    files: &CaptureFiles,
+    bad: Option<&Array2<bool>>,
     limits: &Limits,
     raw: &Path,
     progress: &mut Progress<'_>,
@@ -175,7 +176,7 @@ fn average_masks(
         let place = |index| format!("captures of {name}, file {}", index + 1);
         let mut report = |share| progress(whole(share));
         let open = |path: &Path| formats::open_stack(path, limits);
-        let averaged = average((paths, bad), files.saturation, open, place, &mut report);
+        let averaged = average(paths, bad, files.saturation, open, place, &mut report);
         done += 1;
         averaged
     };
@@ -217,7 +218,8 @@ fn average_masks(
 
 /// Averages all frames of some files, which `open` opens, without the pixels of a map. `place` names a file in errors, by its index.
 pub(super) fn average(
-    (paths, bad): (&[PathBuf], Option<&Array2<bool>>),
+    paths: &[PathBuf],
+    bad: Option<&Array2<bool>>,
     saturation: Option<u32>,
     open: impl Fn(&Path) -> Result<Box<dyn FrameReader + Send>, FormatError>,
     place: impl Fn(usize) -> String,

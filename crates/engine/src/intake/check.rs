@@ -206,7 +206,7 @@ fn average_dark(
             return Err(IntakeError::Size { place: place(index), detail });
         }
     }
-    Ok(Some(average((dark, None), None, open, place, &mut |_| true)?.0.mean))
+    Ok(Some(average(dark, None, None, open, place, &mut |_| true)?.0.mean))
 }
 
 /// A reader that subtracts dark frames and marks pixels without information with NaN.

@@ -220,7 +220,7 @@ pub fn expected(
     let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);
     let unresolved =
         if spectral { "fine texture or spectral detail" } else { "fine texture or fast motion" };
-    let mut reasons = reasons((&error, &unmeasured), (psnr_db, peak), unresolved, warnings);
+    let mut reasons = reasons(&error, &unmeasured, psnr_db, peak, unresolved, warnings);
     reasons.extend(unexplained_pixels(&predictions));
     reasons.extend(exchanged_masks(&orders));
     reasons.extend(fast_motion(motion));
@@ -234,7 +234,7 @@ pub fn expected(
     reasons.retain(|reason| !(withheld && reason.is(FindingCode::UnevenError)));
     let stated = |decibels| (!withheld).then(|| Assessment::round(decibels));
     let assessment = Assessment {
-        grade: grade((psnr_db, high), &reasons),
+        grade: grade(psnr_db, high, &reasons),
         psnr_db: stated(psnr_db),
         psnr_low_db: stated(low),
         psnr_high_db: stated(high),
@@ -307,7 +307,7 @@ fn unexplained_pixels(predictions: &[Prediction]) -> Option<Finding> {
 
 /// The grade by the findings, or else by the expected PSNR, limited by warnings. Frames are graded bad only if the whole interval is below
 /// [`Assessment::BAD_DB`], so that usable pictures are not discarded.
-fn grade((psnr_db, high): (f64, f64), reasons: &[Finding]) -> Grade {
+fn grade(psnr_db: f64, high: f64, reasons: &[Finding]) -> Grade {
     if let Some(grade) = Grade::by_doubts(reasons) {
         return grade;
     }
@@ -328,8 +328,10 @@ const UNEVEN_DB: f64 = 4.0;
 /// The findings of the checks, and the worst part of the picture, from the error and the unmeasured share of each block.
 /// `peak` is the peak of the PSNR, and `unresolved` names what the masks may fail to resolve.
 fn reasons(
-    (error, unmeasured): (&Array3<f32>, &Array3<f64>),
-    (psnr_db, peak): (f64, f64),
+    error: &Array3<f32>,
+    unmeasured: &Array3<f64>,
+    psnr_db: f64,
+    peak: f64,
     unresolved: &str,
     warnings: &[Finding],
 ) -> Vec<Finding> {
@@ -439,7 +441,7 @@ mod tests {
 
     #[test]
     fn findings_limit_the_grade() {
-        let grade_of = |psnr, reasons: &[Finding]| grade((psnr, psnr + 1.5), reasons);
+        let grade_of = |psnr, reasons: &[Finding]| grade(psnr, psnr + 1.5, reasons);
         assert_eq!(
             [30.0, 25.0, 21.0].map(|psnr| grade_of(psnr, &[])),
             [Grade::Good, Grade::Usable, Grade::Usable]

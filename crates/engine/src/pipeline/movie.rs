@@ -97,7 +97,7 @@ pub fn write(path: &Path, task: &MovieTask, monitor: &Monitor) -> Result<()> {
         let reader = open_checked(stack, *sha256, task.shape)?;
         monitor.check()?;
         for k in 0..frames {
-            let frame = levels(&reader, k, (channels, step, task.window))?;
+            let frame = levels(&reader, k, channels, step, task.window)?;
             writer.write_frame(frame.view())?;
             monitor.check()?;
             let done = (index * frames + k + 1) as f64 / count as f64;
@@ -157,7 +157,9 @@ fn open_checked(path: &Path, expected: Sha256, shape: SceneShape) -> Result<Wind
 fn levels(
     reader: &WindowReader,
     k: usize,
-    (channels, step, window): (Channels, usize, DisplayWindow),
+    channels: Channels,
+    step: usize,
+    window: DisplayWindow,
 ) -> Result<Array2<u8>> {
     let DisplayWindow { black, white } = window;
     let (height, samples) = (reader.info().height, reader.info().width);

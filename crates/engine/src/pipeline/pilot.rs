@@ -79,7 +79,7 @@ pub fn decide(
     }
     let decided = record.decide(schedule);
     let findings =
-        joints::compare(&op, (first, y.view()), &candidates, &decided, networks, observer)?;
+        joints::compare(&op, first, y.view(), &candidates, &decided, networks, observer)?;
     record.joints = findings.into_iter().map(joint).collect();
     Ok(Some(record))
 }

@@ -24,14 +24,14 @@ pub fn frames(
     if shape.mosaic.is_none() {
         let report = |share| monitor.reach(TaskStage::Tv, share);
         let window = Window::whole(height, width);
-        return window_frames(arrays, (frames, snapshot, white), &window, monitor, report);
+        return window_frames(arrays, frames, snapshot, white, &window, monitor, report);
     }
     let mut joined = Array3::zeros((0, 0, 0));
     for plane in 0..4 {
         let first = (plane / 2, plane % 2);
         let window = Window::of_plane(0..height / 2, 0..width / 2, first);
         let report = |share| monitor.reach(TaskStage::Tv, (plane as f64 + share) / 4.0);
-        let part = window_frames(arrays, (frames, snapshot, white), &window, monitor, report)?;
+        let part = window_frames(arrays, frames, snapshot, white, &window, monitor, report)?;
         let (frames, rows, columns) = part.dim();
         if joined.is_empty() {
             joined = Array3::zeros((frames, 2 * rows, 2 * columns));
@@ -44,7 +44,9 @@ pub fn frames(
 /// Coarse frames \[B,h,w\] of a window of a snapshot.
 fn window_frames(
     arrays: &Arrays,
-    (frames, snapshot, white): (usize, u32, f32),
+    frames: usize,
+    snapshot: u32,
+    white: f32,
     place: &Window,
     monitor: &Monitor,
     report: impl Fn(f64),

@@ -116,7 +116,8 @@ fn without_estimate(request: RegistrationRequest, is_coloured: bool) -> Option<O
 /// Errors: those of reading and of the solver; a stop by the monitor.
 pub fn register_stored(
     (arrays, snapshots): (&Arrays, SnapshotRange),
-    (request, is_coloured): (RegistrationRequest, bool),
+    request: RegistrationRequest,
+    is_coloured: bool,
     white: f32,
     monitor: &Monitor,
 ) -> Result<Option<Registered>> {

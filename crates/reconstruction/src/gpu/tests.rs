@@ -215,7 +215,7 @@ fn judged(networks: &mut dyn Networks) -> (Vec<[f32; 2]>, Vec<Vec<f64>>) {
             errors.push(state.hold_out_residuals(problem, &hold_out)?);
             Ok(ControlFlow::Continue(()))
         };
-        run_stage(&mut solver, (index, &stage), &mut steps, after).unwrap();
+        run_stage(&mut solver, index, &stage, &mut steps, after).unwrap();
     }
     (steps.0, errors)
 }

@@ -188,7 +188,7 @@ impl Store {
             Checked::Refused(refusal) => return requests::refuse(transaction, id, &refusal).await,
         };
         let lab = requests::find(transaction, id).await?.lab;
-        graph::insert_for(transaction, (&lab, id), TaskKind::Calibration, seconds).await
+        graph::insert_for(transaction, &lab, id, TaskKind::Calibration, seconds).await
     }
 
     /// Reserves `bytes` for the result of a check. The disk must have room for `copies` of them above `min_free`.

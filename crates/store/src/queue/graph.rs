@@ -61,7 +61,8 @@ pub async fn insert(
 /// Writes a task that makes a resource, or something of it, with its planned CPU-seconds.
 pub async fn insert_for(
     connection: &mut SqliteConnection,
-    (lab, resource): (&Lab, ResourceId),
+    lab: &Lab,
+    resource: ResourceId,
     kind: TaskKind,
     cost: f64,
 ) -> Result<()> {

@@ -62,7 +62,8 @@ impl Store {
     pub async fn create_movie(
         &self,
         job: &Job,
-        (snapshot, format): (Option<u32>, MovieFormat),
+        snapshot: Option<u32>,
+        format: MovieFormat,
         window: &Value,
     ) -> Result<Movie> {
         let task = format.task(snapshot);
@@ -80,7 +81,7 @@ impl Store {
         let known = known.fetch_optional(&mut *transaction).await?;
         known.ok_or_else(|| StoreError::missing("job", job.id))?;
         let cost = job.spec.movie_cost(format, snapshot);
-        graph::insert_for(&mut transaction, (&job.lab, job.id.into()), task, cost).await?;
+        graph::insert_for(&mut transaction, &job.lab, job.id.into(), task, cost).await?;
         sql!(
             "UPDATE tasks SET record = ? WHERE thing = ? AND kind = ? AND coalesce(snapshot, -1) = ?",
             [Json(window), job.id, task.into_str(), place(task)]

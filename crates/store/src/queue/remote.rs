@@ -178,8 +178,10 @@ impl Store {
     /// lost, and this is the next.
     pub async fn remote_begin(
         &self,
-        (task, pool): (TaskId, &str),
-        (message, seq): (u32, i64),
+        task: TaskId,
+        pool: &str,
+        message: u32,
+        seq: i64,
         delivery: u32,
         worker: WorkerId,
     ) -> Result<Begun, StoreError> {

@@ -124,7 +124,8 @@ impl Store {
 /// Errors: [`StoreError::NotFound`] if an upload, the calibration or the job was deleted.
 pub async fn insert(
     connection: &mut SqliteConnection,
-    (lab, token): (&Lab, Option<TokenId>),
+    lab: &Lab,
+    token: Option<TokenId>,
     id: ResourceId,
     (submission, limits, origin): (&Submission, &CheckLimits, Option<&str>),
 ) -> Result<u64> {

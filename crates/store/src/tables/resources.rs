@@ -288,7 +288,7 @@ impl Store {
         let found = sql_as!(found, [resource, lab, what]).fetch_optional(&mut *transaction).await?;
         let prepared: Option<Sha256> = found.ok_or_else(|| StoreError::missing(what, id))?;
         for users in users(Id::KIND) {
-            refuse_if_used(&mut transaction, (what, id.to_string()), *users).await?;
+            refuse_if_used(&mut transaction, what, id.to_string(), *users).await?;
         }
         sql!("DELETE FROM requests WHERE id = ?", [resource]).execute(&mut *transaction).await?;
         if let Some(prepared) = prepared {

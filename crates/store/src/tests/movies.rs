@@ -26,7 +26,7 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
     let job = lab.done().await;
     for _ in 0..2 {
         let asked =
-            lab.store.create_movie(&job, (Some(1), MovieFormat::Mp4), &Value::Null).await.unwrap();
+            lab.store.create_movie(&job, Some(1), MovieFormat::Mp4, &Value::Null).await.unwrap();
         assert_eq!(asked, Movie::Asked(None));
     }
     assert_eq!(
@@ -35,7 +35,7 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
         "reading creates no movie"
     );
     assert_eq!(
-        lab.store.create_movie(&job, (None, MovieFormat::Mp4), &Value::Null).await.unwrap(),
+        lab.store.create_movie(&job, None, MovieFormat::Mp4, &Value::Null).await.unwrap(),
         Movie::Asked(None)
     );
     let other = lab.submit(-100).await;
@@ -60,7 +60,7 @@ async fn a_movie_comes_before_the_jobs_of_its_lab() {
 async fn a_movie_that_fails_fails_nothing_else() {
     let lab = Lab::new().await;
     let job = lab.done().await;
-    lab.store.create_movie(&job, (None, MovieFormat::Mp4), &Value::Null).await.unwrap();
+    lab.store.create_movie(&job, None, MovieFormat::Mp4, &Value::Null).await.unwrap();
     let task = lab.claim().await.unwrap();
     assert_eq!(task.kind, TaskKind::Movie { snapshot: None });
     assert_eq!(
@@ -74,7 +74,7 @@ async fn a_movie_that_fails_fails_nothing_else() {
         assert_eq!(lab.store.movie(&job, None, MovieFormat::Mp4).await.unwrap(), failed);
     }
     assert_eq!(
-        lab.store.create_movie(&job, (None, MovieFormat::Mp4), &Value::Null).await.unwrap(),
+        lab.store.create_movie(&job, None, MovieFormat::Mp4, &Value::Null).await.unwrap(),
         Movie::Asked(None)
     );
 
@@ -97,7 +97,7 @@ async fn a_movie_takes_its_labs_turn_in_a_queue_that_never_ends() {
     }
     // Jobs of both labs have begun.
     lab.work_on(6).await;
-    lab.store.create_movie(&job, (Some(0), MovieFormat::Mp4), &Value::Null).await.unwrap();
+    lab.store.create_movie(&job, Some(0), MovieFormat::Mp4, &Value::Null).await.unwrap();
     let mut before = 0;
     loop {
         let task = lab.claim().await.unwrap();
@@ -109,7 +109,7 @@ async fn a_movie_takes_its_labs_turn_in_a_queue_that_never_ends() {
     }
     assert!(before <= 3, "{before} tasks came before it");
     // An administrator's urgent job comes first.
-    lab.store.create_movie(&job, (None, MovieFormat::Mp4), &Value::Null).await.unwrap();
+    lab.store.create_movie(&job, None, MovieFormat::Mp4, &Value::Null).await.unwrap();
     lab.submit(5).await;
     assert_eq!(lab.claim().await.unwrap().kind, TaskKind::Prepare);
 }

@@ -23,7 +23,7 @@ async fn a_tile_that_waits_elsewhere_does_not_run() {
     };
     let (running, waiting) = seen().await;
     assert_eq!(running, 0, "no worker has it in hand");
-    let begun = lab.store.remote_begin((out.task, "gpu"), (out.attempt, 1), 1, lab.worker).await;
+    let begun = lab.store.remote_begin(out.task, "gpu", out.attempt, 1, 1, lab.worker).await;
     assert_eq!(begun.unwrap(), Begun::Go(1, false));
     let (running, begun) = seen().await;
     assert_eq!(running, 1);

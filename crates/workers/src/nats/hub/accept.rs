@@ -79,7 +79,7 @@ impl Core {
     ) -> Result<Accepted, HubError> {
         let known = self.known(remote).await?;
         let Report { frames, progress, record, history } = report;
-        let record = match known.check(remote, frames, (&progress, record, history.as_deref())) {
+        let record = match known.check(remote, frames, &progress, record, history.as_deref()) {
             Ok(record) => record,
             Err(reason) => return Ok(Accepted::Refused(reason)),
         };
@@ -176,7 +176,9 @@ impl Known {
         &self,
         remote: &RemoteTask,
         frames: Input,
-        (progress, record, history): (&TaskProgress, Value, Option<&str>),
+        progress: &TaskProgress,
+        record: Value,
+        history: Option<&str>,
     ) -> Result<TileTaskRecord, String> {
         if frames.bytes != self.bytes {
             let [count, height, width] = self.shape;

@@ -191,10 +191,10 @@ impl Core {
         if self.leaves_to_another(pool, task, worker).await? {
             return Ok(BeginAnswer::Another);
         }
-        let task = (task, pool.as_str());
-        Ok(match self.store.remote_begin(task, (attempt, seq), delivery, worker).await? {
+        let pool = pool.as_str();
+        Ok(match self.store.remote_begin(task, pool, attempt, seq, delivery, worker).await? {
             Begun::Go(attempt, redelivered) => {
-                lock(&self.presence).begin(worker, task.0);
+                lock(&self.presence).begin(worker, task);
                 figures::count(figures::REDELIVERED, u64::from(redelivered));
                 BeginAnswer::Go(attempt)
             }
