@@ -57,8 +57,8 @@ pub fn run(arguments: &Arguments) -> Result<()> {
         let file = file.map_err(FormatError::io("write masks.npy"))?;
         npy::writer(BufWriter::new(file), (info.frames, info.height, info.width), Channels::Grey)
     };
-    let from = (&files, arguments.bad_pixels.as_deref());
-    let calibrated = calibrate(from, &Limits::default(), scratch.path(), masks, &mut share);
+    let (bad, limits) = (arguments.bad_pixels.as_deref(), Limits::default());
+    let calibrated = calibrate(&files, bad, &limits, scratch.path(), masks, &mut share);
     let (calibrated, _) = calibrated.map_err(|error| match error.is_retryable() {
         // Includes failures to write.
         true => CliError::Failure(error.to_string()),

@@ -410,8 +410,8 @@ impl<'a> Input<'a> {
             None => None,
         };
         let has_dark = !dark.is_empty();
-        let arrays = (masks.array.view(), measurement.array.view());
-        let (calibration, judged) = judge(arrays, (mosaic, dispersion.as_ref()), has_dark)?;
+        let (masks_view, y) = (masks.array.view(), measurement.array.view());
+        let (calibration, judged) = judge(masks_view, y, mosaic, dispersion.as_ref(), has_dark)?;
         let judged = judged.into_iter().map(|finding| {
             // Findings count from the first snapshot of the file.
             let snapshot = finding.snapshot.map(|index| index + first as u32);
@@ -550,16 +550,18 @@ impl<'a> Input<'a> {
 /// Runs the checks of the service on masks \[B,H,W\] and snapshots \[S,H,W\], and returns the warning of the masks and the
 /// findings on the snapshots. The checks read prepared files, so the arrays are written to temporary ones.
 fn judge(
-    (masks, snapshots): (ArrayView3<'_, f32>, ArrayView3<'_, f32>),
-    (mosaic, dispersion): (Option<Mosaic>, Option<&Dispersion>),
+    masks: ArrayView3<'_, f32>,
+    snapshots: ArrayView3<'_, f32>,
+    mosaic: Option<Mosaic>,
+    dispersion: Option<&Dispersion>,
     has_dark: bool,
 ) -> Result<(Option<Finding>, Vec<Finding>)> {
     let limits = Limits::default();
-    let prepared = [prepare(masks)?, prepare(snapshots)?];
-    let paths = (prepared[0].path(), prepared[1].path());
-    let masks = planar::Reader::open(paths.0, &limits)?;
-    let report = intake::report(&masks, dispersion.is_some(), &mut |_| true)?;
-    let judged = intake::judge(paths, (mosaic, dispersion), has_dark, &limits)?;
+    let (masks, snapshots) = (prepare(masks)?, prepare(snapshots)?);
+    let reader = planar::Reader::open(masks.path(), &limits)?;
+    let report = intake::report(&reader, dispersion.is_some(), &mut |_| true)?;
+    let judged =
+        intake::judge(masks.path(), snapshots.path(), mosaic, dispersion, has_dark, &limits)?;
     Ok((report.report.warning(), judged))
 }
 

@@ -331,10 +331,10 @@ impl Running<'_> {
         })?;
         let staged = writer.finish()?.finish()?;
         let prepared = self.check.store.dir().blob(&calibration.prepared);
-        let arrays = (prepared.as_path(), staged.path());
+        let (mosaic, dispersion) = (masks.mosaic, masks.dispersion.as_ref());
         let has_dark = !exposure.dark.is_empty();
         let judged =
-            intake::judge(arrays, (masks.mosaic, masks.dispersion.as_ref()), has_dark, &limits)?;
+            intake::judge(&prepared, staged.path(), mosaic, dispersion, has_dark, &limits)?;
         let warnings = intake::combined(passed.findings, judged);
         let estimated = match masks.dispersion {
             // The last band of a snapshot and the first of the next one do not resemble one another.

@@ -135,9 +135,9 @@ pub(super) fn perform(
             let open =
                 |info: &StackInfo| planar::writer(masks, info.frames, info.height, info.width);
             let limits = Limits::default();
-            let files = (&files, bad_pixels.as_deref());
+            let bad = bad_pixels.as_deref();
             let (calibrated, masks) =
-                calibrate(files, &limits, scratch.path(), open, &mut |share| {
+                calibrate(&files, bad, &limits, scratch.path(), open, &mut |share| {
                     proceed(share, monitor)
                 })?;
             let masks = masks.finish().map_err(TransportError::from)?;

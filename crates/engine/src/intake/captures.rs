@@ -65,7 +65,8 @@ pub struct Report {
 ///
 /// Errors: unreadable or unusable captures or patterns; I/O; [`IntakeError::Stopped`]; those of `open`.
 pub fn calibrate<W: Write>(
-    (files, bad): (&CaptureFiles, Option<&Path>),
+    files: &CaptureFiles,
+    bad: Option<&Path>,
     limits: &Limits,
     scratch: &Path,
     open: impl FnOnce(&StackInfo) -> Result<StackWriter<W>, FormatError>,

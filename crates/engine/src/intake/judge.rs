@@ -83,17 +83,22 @@ pub fn causes_first(findings: &mut [Finding]) {
 ///
 /// Errors: files that can't be read.
 pub fn judge(
-    (masks, snapshots): (&Path, &Path),
-    (mosaic, dispersion): (Option<Mosaic>, Option<&Dispersion>),
+    masks: &Path,
+    snapshots: &Path,
+    mosaic: Option<Mosaic>,
+    dispersion: Option<&Dispersion>,
     dark_subtracted: bool,
     limits: &Limits,
 ) -> Result<Vec<Finding>, FormatError> {
-    let (masks, snapshots) = (Reader::open(masks, limits)?, Reader::open(snapshots, limits)?);
-    let count = snapshots.info().frames;
+    let files = Files {
+        masks: &Reader::open(masks, limits)?,
+        snapshots: &Reader::open(snapshots, limits)?,
+    };
+    let count = files.snapshots.info().frames;
     let mut findings = Vec::new();
     for sample in 0..count.min(SNAPSHOTS) {
         let snapshot = sample * count / count.min(SNAPSHOTS);
-        let studied = study((&masks, &snapshots), snapshot, mosaic, Turn::default())?;
+        let studied = study(files, snapshot, mosaic, Turn::default())?;
         let Some(mut figures) = studied.finish() else { continue };
         if let Some(part) = figures.unmodulated.as_mut().filter(|_| mosaic.is_some()) {
             part.place = part.place.map(|at| 2 * at);
@@ -110,7 +115,7 @@ pub fn judge(
             && !figures.is_flat
             && figures.explained_unshifted < MIN_EXPLAINED
             && !judged.iter().any(|finding| explained.contains(&finding.code))
-            && let Some(misplaced) = misplaced_masks((&masks, &snapshots), snapshot, &figures)?
+            && let Some(misplaced) = misplaced_masks(files, snapshot, &figures)?
             // Blocks show the other places of the masks of a spectral camera.
             && (dispersion.is_none() || misplaced.code == FindingCode::TurnedMasks)
         {
@@ -124,7 +129,7 @@ pub fn judge(
         if let Some(dispersion) = dispersion
             && !judged.iter().any(|finding| named.contains(&finding.code))
         {
-            let fit = block_study((&masks, &snapshots), snapshot)?.finish(dispersion.axis);
+            let fit = block_study(files, snapshot)?.finish(dispersion.axis);
             judged.splice(0..0, judge_blocks(fit.as_ref()));
         }
         let judged = judged.into_iter();
@@ -132,6 +137,15 @@ pub fn judge(
             .extend(judged.map(|finding| Finding { snapshot: number, ..Finding::from(finding) }));
     }
     Ok(findings)
+}
+
+/// Prepared files.
+#[derive(Clone, Copy)]
+struct Files<'a> {
+    /// \[B,H,W\]
+    masks: &'a Reader,
+    /// \[S,H,W\]
+    snapshots: &'a Reader,
 }
 
 /// Another orientation of masks.
@@ -207,7 +221,7 @@ const LARGEST_DISPLACEMENT: usize = 32;
 
 /// Looks for a displacement or an orientation of the masks that explains a snapshot, which the given one does not.
 fn misplaced_masks(
-    files: (&Reader, &Reader),
+    files: Files<'_>,
     snapshot: usize,
     given: &MeasurementFigures,
 ) -> Result<Option<optics::Finding>, FormatError> {
@@ -263,7 +277,7 @@ fn explained_after(
 
 /// Looks for a displacement by more pixels than a fit of the frames covers, as after a wrong crop.
 fn displaced_masks(
-    (masks, snapshots): (&Reader, &Reader),
+    Files { masks, snapshots }: Files<'_>,
     snapshot: usize,
     given: &MeasurementFigures,
 ) -> Result<Option<Misplaced>, FormatError> {
@@ -300,7 +314,7 @@ const MAGNIFIED_WINDOW: usize = 256;
 
 /// Looks for a magnification of the masks that explains a snapshot, which the given one does not.
 fn magnified_masks(
-    (masks, snapshots): (&Reader, &Reader),
+    Files { masks, snapshots }: Files<'_>,
     snapshot: usize,
     given: &MeasurementFigures,
 ) -> Result<Option<Misplaced>, FormatError> {
@@ -343,11 +357,11 @@ fn magnified_masks(
 
 /// Looks for an orientation of the masks that explains a snapshot, which the given one does not.
 fn turned_masks(
-    files: (&Reader, &Reader),
+    files: Files<'_>,
     snapshot: usize,
     given: &MeasurementFigures,
 ) -> Result<Option<Misplaced>, FormatError> {
-    let (height, width) = (files.0.info().height, files.0.info().width);
+    let (height, width) = (files.masks.info().height, files.masks.info().width);
     let mut best: Option<(f64, Turn)> = None;
     for turn in Turn::others(height, width) {
         let figures = study(files, snapshot, None, turn)?.finish();
@@ -376,7 +390,7 @@ fn turned_masks(
 
 /// Computes the statistics of windows that are spread evenly over a snapshot, with turned masks.
 fn study(
-    (masks, snapshots): (&Reader, &Reader),
+    Files { masks, snapshots }: Files<'_>,
     snapshot: usize,
     mosaic: Option<Mosaic>,
     turn: Turn,
@@ -409,7 +423,7 @@ const BLOCK_WINDOWS: usize = 3;
 
 /// Fits the blocks of windows that are spread evenly over a snapshot.
 fn block_study(
-    (masks, snapshots): (&Reader, &Reader),
+    Files { masks, snapshots }: Files<'_>,
     snapshot: usize,
 ) -> Result<BlockStudy, FormatError> {
     let (frames, height, width) = (masks.info().frames, masks.info().height, masks.info().width);
