@@ -23,7 +23,8 @@ use super::progress::SnapshotBar;
 use super::verdict;
 use crate::cli::error::{Result, open_input};
 use engine::intake::{
-    self, Behind, Exposure, Scaled, Source, expected_size, read_masks, read_snapshots, read_truth,
+    self, Exposure, MaskLight, Scaled, Source, expected_size, read_masks, read_snapshots,
+    read_truth,
 };
 use engine::job::{
     Algorithm, Assessment, CalibrationId, CalibrationRequest, Dispersion, Finding, Grade, Inputs,
@@ -43,7 +44,7 @@ use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{OnDisk, check_output, replace_result, write_result};
 use formats::mat::SceneArray;
-use formats::{Axes, Channels, Limits, Part, planar};
+use formats::{Axes, Channels, Limits, Selection, planar};
 use reconstruction::registration::Correction;
 use reconstruction::sequence::SequencePlan;
 use reconstruction::tile::{TilePlan, Window};
@@ -301,7 +302,7 @@ impl<'a> Sources<'a> {
             .named(arguments.mask_file.masks_array.as_ref().map(ToString::to_string))
             .arranged(arguments.mask_file.masks_axes, None)
             .part(
-                Part {
+                Selection {
                     crop: arguments.mask_file.masks_crop,
                     frames: arguments.mask_file.masks_frames,
                 },
@@ -316,7 +317,7 @@ impl<'a> Sources<'a> {
             .named(arguments.snapshot_file.array.as_ref().map(ToString::to_string))
             .arranged(arguments.snapshot_file.axes, None)
             .part(
-                Part { crop: arguments.snapshot_file.crop, frames: None },
+                Selection { crop: arguments.snapshot_file.crop, frames: None },
                 arguments.snapshot_file.packing,
             ),
             truth: named(&arguments.truth).map(|path| {
@@ -363,7 +364,7 @@ impl<'a> Input<'a> {
         let SnapshotFileArguments { dark, saturation, .. } = &arguments.snapshot_file;
         let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
         let behind =
-            Behind { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
+            MaskLight { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
         let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))
             .map_err(|error| CliError::from(error).about(Role::Measurement))?;
         let (measurement, snapshots) = (read.measurement, read.count);
@@ -418,7 +419,7 @@ impl<'a> Input<'a> {
             Finding { snapshot, ..finding }
         });
         let mut findings: Vec<Finding> = calibration.into_iter().collect();
-        findings.extend(intake::combined(read.passed.findings, judged.collect()));
+        findings.extend(intake::combined(read.findings, judged.collect()));
         intake::causes_first(&mut findings);
         Ok(Self { sources, masks, measurement, first, truth, mosaic, findings, registration: None })
     }

@@ -11,7 +11,7 @@ use super::download::{Download, stream_range};
 use super::error::{Problem, Result};
 use super::extract::{Caller, Params, QueryOf};
 use super::page::{Cursor, Limit};
-use super::submissions::{ResourceApi, Stage, page, pending};
+use super::submissions::{ResourceApi, ResourceState, page, pending};
 use engine::job::{
     CalibrationId, CalibrationRequest, Dispersion, JobId, Label, Mosaic, Reading, Sha256,
     Submission, Timestamp,
@@ -34,7 +34,7 @@ pub(super) struct ListQuery {
 #[schemars(rename = "Calibration")]
 pub(super) struct CalibrationBody {
     id: CalibrationId,
-    state: Stage,
+    state: ResourceState,
     /// Share of the work that is done, in percent.
     percent: f64,
     /// The failure in words.
@@ -92,7 +92,7 @@ impl ResourceApi for CalibrationId {
                 let facts = calibration.facts;
                 return Ok(CalibrationBody {
                     id: calibration.id,
-                    state: Stage::Ready,
+                    state: ResourceState::Ready,
                     percent: 100.0,
                     error: None,
                     problem: None,

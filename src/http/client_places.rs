@@ -46,16 +46,16 @@ pub(super) async fn limit(
             return refused.retry_after(full.seconds).into_response();
         }
     };
-    next.run(request).await.map(|body| Body::new(Held { body, _place: place }))
+    next.run(request).await.map(|body| Body::new(PlacedBody { body, _place: place }))
 }
 
 /// A body that keeps a place until it is sent.
-struct Held {
+struct PlacedBody {
     body: Body,
     _place: Place<IpAddr>,
 }
 
-impl HttpBody for Held {
+impl HttpBody for PlacedBody {
     type Data = Bytes;
     type Error = axum::Error;
 

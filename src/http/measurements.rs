@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::error::{Problem, Result};
-use super::submissions::{ResourceApi, Stage, pending};
+use super::submissions::{ResourceApi, ResourceState, pending};
 use engine::job::{
     CalibrationId, Finding, Label, MeasurementId, MeasurementRequest, Reading, Sequence, Sha256,
     Submission, Timestamp,
@@ -15,7 +15,7 @@ use store::{FoundResource, StoreError};
 #[schemars(rename = "Measurement")]
 pub(super) struct MeasurementBody {
     id: MeasurementId,
-    state: Stage,
+    state: ResourceState,
     /// The failure in words.
     error: Option<String>,
     /// The failure, as an answer to the request would have stated it.
@@ -66,7 +66,7 @@ impl ResourceApi for MeasurementId {
                 let facts = measurement.facts;
                 return Ok(MeasurementBody {
                     id: measurement.id,
-                    state: Stage::Ready,
+                    state: ResourceState::Ready,
                     error: None,
                     problem: None,
                     created_at: measurement.created_at,

@@ -29,7 +29,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 #[serde(rename_all = "snake_case")]
 #[derive(schemars::JsonSchema)]
 #[schemars(rename = "ResourceState")]
-pub(super) enum Stage {
+pub(super) enum ResourceState {
     /// Files are being checked, or masks computed from captures.
     Preparing,
     Ready,
@@ -127,8 +127,10 @@ pub(super) async fn delete<Id: ResourceApi>(
 }
 
 /// State of a pending request; if it failed, the reason in words and as a problem.
-pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Problem>) {
-    let Some(refusal) = request.refusal.clone() else { return (Stage::Preparing, None, None) };
+pub(super) fn pending(request: &Request) -> (ResourceState, Option<String>, Option<Problem>) {
+    let Some(refusal) = request.refusal.clone() else {
+        return (ResourceState::Preparing, None, None);
+    };
     let detail = refusal.detail.clone();
     let problem = || ApiError::from(refusal).problem();
     // The answer to the original request would have had the same problem.
@@ -136,7 +138,7 @@ pub(super) fn pending(request: &Request) -> (Stage, Option<String>, Option<Probl
         Some(origin) => REQUEST_ID.sync_scope(origin, problem),
         None => problem(),
     };
-    (Stage::Failed, Some(detail), Some(problem))
+    (ResourceState::Failed, Some(detail), Some(problem))
 }
 
 /// Creates a resource, or returns the one that was created with the same key. Waits up to `patience` for the check of its

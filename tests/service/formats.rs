@@ -6,7 +6,7 @@ use std::process::Command;
 
 use engine::intake::Source;
 use formats::mat::SceneArray;
-use formats::{Limits, Part, read_stack};
+use formats::{Limits, Selection, read_stack};
 use ndarray::Array3;
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -104,7 +104,7 @@ impl Judge {
         let source = Source::upload(file, array, scale, Limits::default())
             .named(stated("array"))
             .arranged(axes, written.measurement.then_some((48, 64)))
-            .part(Part::default(), stated("packing").map(|packing| packing.parse().unwrap()));
+            .part(Selection::default(), stated("packing").map(|packing| packing.parse().unwrap()));
         let mut opened = source.open().unwrap();
         let mut values = Vec::new();
         while let Some(frame) = opened.next_frame().unwrap() {

@@ -14,8 +14,8 @@ use super::photo::{self, read_picture};
 use super::pictures::Pictures;
 use super::scene::list;
 use super::{
-    Axes, Expected, Format, FormatError, FrameReader, Limits, Packing, Part, Reader, StackInfo,
-    hdf5, npy, npz, png, tar, tiff, zip,
+    Axes, Expected, Format, FormatError, FrameReader, Limits, Packing, Reader, Selection,
+    StackInfo, hdf5, npy, npz, png, tar, tiff, zip,
 };
 use crate::error::Result;
 
@@ -32,7 +32,7 @@ pub struct Wanted<'a> {
     /// Prior knowledge about its shape.
     pub expected: Expected,
     /// The part that is read.
-    pub part: Part,
+    pub part: Selection,
     /// How the pixels are packed; `None` for one sample per value.
     pub packing: Option<Packing>,
 }
@@ -43,7 +43,7 @@ impl From<SceneArray> for Wanted<'_> {
             array,
             name: None,
             expected: Expected::default(),
-            part: Part::default(),
+            part: Selection::default(),
             packing: None,
         }
     }

@@ -7,7 +7,7 @@ use ndarray::Array2;
 
 /// A part of the picture.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Part {
+pub(super) struct Region {
     /// Row and column of its middle.
     pub(super) place: [f64; 2],
     /// Share of its fine structure that the masks explain at each displacement, by rows and columns.
@@ -43,7 +43,7 @@ const MIN_DISPLACEMENT: f64 = 0.15;
 
 /// Displacement (rows, columns) in pixels of the masks that fits a part best, and its share of the fine structure; `None`
 /// at the edge of the search.
-fn displacement(part: &Part) -> Option<([f64; 2], f64)> {
+fn displacement(part: &Region) -> Option<([f64; 2], f64)> {
     let roots = part.explained.mapv(|share| share.max(0.0).sqrt());
     let (rows, columns) = roots.dim();
     let ((row, column), peak) = roots.indexed_iter().max_by(|a, b| a.1.total_cmp(b.1))?;
@@ -112,7 +112,7 @@ impl Model {
 }
 
 /// The distortion on which the parts agree; `None` if there is none.
-pub(super) fn distortion(parts: &[Part]) -> Option<Distortion> {
+pub(super) fn distortion(parts: &[Region]) -> Option<Distortion> {
     let found = parts
         .iter()
         .filter_map(|part| displacement(part).map(|(moved, weight)| (part.place, moved, weight)));
@@ -170,7 +170,7 @@ const MIN_PRODUCT: f64 = 0.2;
 /// Parts that the masks fit after the same displacement, if the others fit without one.
 ///
 /// The products with the sum of the masks decide: single masks that resemble one another fit elsewhere, too.
-pub(super) fn moved_parts(parts: &[Part]) -> Option<MovedParts> {
+pub(super) fn moved_parts(parts: &[Region]) -> Option<MovedParts> {
     let peaks: Vec<_> = parts
         .iter()
         .filter_map(|part| {

@@ -13,7 +13,7 @@ use std::ops::{Range, RangeInclusive};
 use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use super::calibration_check::mask_scale;
-use super::distortion::{Distortion, MovedParts, Part, distortion, moved_parts};
+use super::distortion::{Distortion, MovedParts, Region, distortion, moved_parts};
 use super::mask_values::{Alteration, Observed, alteration};
 use super::measurement_fit::{
     BLOCK, Fit, LocalFit, Strip, brightness_errors, equal_weights, reweighted,
@@ -87,7 +87,7 @@ pub struct MeasurementStudy {
     frames: usize,
     /// `sum C_k'(p + shift) y'(p)` for each shift and frame; primed values are block-centred.
     correlations: Vec<Array1<f64>>,
-    parts: Vec<Correlated>,
+    parts: Vec<CorrelatedRegion>,
     /// `sum y'(p)^2`.
     energy: f64,
     /// Number of measured pixels.
@@ -102,7 +102,7 @@ pub struct MeasurementStudy {
 
 /// A part of a window.
 #[derive(Debug)]
-struct Correlated {
+struct CorrelatedRegion {
     /// Row and column of its middle.
     place: [f64; 2],
     /// As those of the whole study.
@@ -283,7 +283,7 @@ impl MeasurementStudy {
                 let middle = |first: usize, part: &Range<usize>| {
                     (first + REACH) as f64 + (part.start + part.end) as f64 / 2.0
                 };
-                let mut part = Correlated {
+                let mut part = CorrelatedRegion {
                     place: [middle(first_row, &part_rows), middle(first_column, &part_columns)],
                     correlations: shifts().map(|_| Array1::zeros(frames)).collect(),
                     energy: y.iter().map(|&value| f64::from(value).powi(2)).sum(),
@@ -357,7 +357,7 @@ impl MeasurementStudy {
             let explained = Array2::from_shape_vec((side, side), shares.collect()).ok()?;
             let products = part.correlations.iter().map(|sums| sums.sum()).collect();
             let products = Array2::from_shape_vec((side, side), products).ok()?;
-            Some(Part { place: part.place, explained, products })
+            Some(Region { place: part.place, explained, products })
         });
         let parts: Vec<_> = parts.flatten().collect();
         let (weighted, explained_energy, weights) = reweighted(&self.strips)?;

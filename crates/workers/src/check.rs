@@ -12,7 +12,7 @@ use super::model_check;
 use super::model_process::ModelCommand;
 use super::transport::{Check, TaskError};
 use engine::intake::{
-    self, Behind, Exposure, IntakeError, Refusal, RefusalCode, Source, expected_size, plan,
+    self, Exposure, IntakeError, MaskLight, Refusal, RefusalCode, Source, expected_size, plan,
     size_remedy,
 };
 use engine::job::{
@@ -22,7 +22,7 @@ use engine::job::{
 use engine::pipeline::progress::Monitor;
 use engine::pipeline::registration;
 use formats::mat::SceneArray;
-use formats::{Channels, FormatError, Limits, Part, StackInfo, StackWriter, npy, planar};
+use formats::{Channels, FormatError, Limits, Selection, StackInfo, StackWriter, npy, planar};
 use store::{
     BlobWriter, Calibration, Checked, NewCalibration, NewMeasurement, NewModel, StoreError,
 };
@@ -193,7 +193,7 @@ impl Running<'_> {
         let source = Source::upload(&file, SceneArray::Masks, request.full_scale, self.limits())
             .named(array.map(|name| name.to_string()))
             .arranged(axes, None)
-            .part(Part { crop, frames }, packing)
+            .part(Selection { crop, frames }, packing)
             .dispersed(dispersion.clone());
         let opened = source.open()?;
         let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
@@ -301,7 +301,7 @@ impl Running<'_> {
         let source = Source::upload(&file, SceneArray::Measurements, request.full_scale, limits)
             .named(request.array.map(|name| name.to_string()))
             .arranged(request.axes, Some((masks.height, masks.width)))
-            .part(Part { crop: request.crop, frames: None }, request.packing);
+            .part(Selection { crop: request.crop, frames: None }, request.packing);
         let opened = source.open()?;
         let (info, full_scale, reading) = (opened.info, opened.full_scale.value(), opened.reading);
         if (info.height, info.width) != (masks.height, masks.width) {
@@ -322,9 +322,9 @@ impl Running<'_> {
         let mut writer = self.writer(&info)?;
         let exposure = Exposure { dark, saturation: request.saturation };
         let prepared = self.check.store.dir().blob(&calibration.prepared);
-        let behind = Behind::stored(&prepared, masks.mosaic, &limits)?;
+        let behind = MaskLight::stored(&prepared, masks.mosaic, &limits)?;
         let mut done = 0.0;
-        let passed = intake::measurement(opened, &exposure, &behind, &limits, |y| {
+        let findings = intake::measurement(opened, &exposure, &behind, &limits, |y| {
             done += 1.0;
             self.proceed(done / info.frames as f64)?;
             writer.write_frame(y)
@@ -335,7 +335,7 @@ impl Running<'_> {
         let has_dark = !exposure.dark.is_empty();
         let judged =
             intake::judge(&prepared, staged.path(), mosaic, dispersion, has_dark, &limits)?;
-        let warnings = intake::combined(passed.findings, judged);
+        let warnings = intake::combined(findings, judged);
         let estimated = match masks.dispersion {
             // The last band of a snapshot and the first of the next one do not resemble one another.
             Some(_) => Sequence::Separate,

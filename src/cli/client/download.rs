@@ -91,8 +91,8 @@ impl Client {
         path: PathBuf,
         size: u64,
         bar: &ProgressBar,
-    ) -> Result<Part> {
-        let mut part = Part::open(path, size)?;
+    ) -> Result<PartialFile> {
+        let mut part = PartialFile::open(path, size)?;
         let mut attempt = 0;
         loop {
             bar.set_position(part.length());
@@ -148,7 +148,7 @@ const RECORD_BYTES: u64 = 1 << 20;
 
 /// An incomplete file. A second file records the length and the hash of its beginning, because a power failure can leave
 /// other bytes than were received.
-struct Part {
+struct PartialFile {
     file: LockedFile,
     path: PathBuf,
     /// Hash and number of the bytes in the file.
@@ -157,7 +157,7 @@ struct Part {
     recorded: u64,
 }
 
-impl Part {
+impl PartialFile {
     /// Opens the file, and keeps of an earlier one the beginning that agrees with its record.
     fn open(path: PathBuf, size: u64) -> Result<Self, CliError> {
         let unwritable = |error: std::io::Error| CliError::file("write", &path, &error);

@@ -25,7 +25,7 @@ pub(super) struct Shot {
 /// Progress of a file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "state")]
-pub(super) enum Stage {
+pub(super) enum FileState {
     /// Not submitted yet, or perhaps submitted under its key.
     Taken,
     Submitted {
@@ -40,7 +40,7 @@ pub(super) enum Stage {
     },
 }
 
-impl Stage {
+impl FileState {
     pub(super) fn is_final(&self) -> bool {
         matches!(self, Self::Done { .. } | Self::Failed { .. })
     }
@@ -57,7 +57,7 @@ pub(super) struct Entry {
     /// Name of the results or of the failure's reason. No file had the name when the entry was made.
     pub(super) results: String,
     #[serde(flatten)]
-    pub(super) stage: Stage,
+    pub(super) stage: FileState,
 }
 
 pub(super) struct Ledger {
@@ -133,9 +133,9 @@ pub(super) fn path_in(folder: &Path) -> PathBuf {
 mod tests {
     use std::fs;
 
-    use super::{Entry, Ledger, Shot, Stage};
+    use super::{Entry, FileState, Ledger, Shot};
 
-    fn entry(name: &str, stage: Stage) -> Entry {
+    fn entry(name: &str, stage: FileState) -> Entry {
         let shot = Shot { name: name.into(), size: 3, time: (1, 2) };
         let recipe = serde_json::json!({"measurement": {"calibration": "c"}, "job": {}});
         let recipe = serde_json::from_value(recipe).unwrap();
@@ -148,16 +148,16 @@ mod tests {
         let path = folder.path().join("ledger");
         let mut ledger = Ledger::open(path.clone()).unwrap();
         assert!(Ledger::open(path.clone()).is_err(), "one process at a time");
-        ledger.record(entry("a", Stage::Taken)).unwrap();
-        ledger.record(entry("b", Stage::Taken)).unwrap();
-        ledger.record(entry("a", Stage::Done { job: "j".into() })).unwrap();
+        ledger.record(entry("a", FileState::Taken)).unwrap();
+        ledger.record(entry("b", FileState::Taken)).unwrap();
+        ledger.record(entry("a", FileState::Done { job: "j".into() })).unwrap();
         drop(ledger);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, format!("{text}{{\"name\": \"c\", \"si")).unwrap();
         let mut ledger = Ledger::open(path.clone()).unwrap();
-        assert_eq!(ledger.open_entries(), [entry("b", Stage::Taken)]);
-        assert!(ledger.has(&entry("a", Stage::Taken).shot) && ledger.has_results("b.result"));
-        ledger.record(entry("b", Stage::Failed { reason: "r".into() })).unwrap();
+        assert_eq!(ledger.open_entries(), [entry("b", FileState::Taken)]);
+        assert!(ledger.has(&entry("a", FileState::Taken).shot) && ledger.has_results("b.result"));
+        ledger.record(entry("b", FileState::Failed { reason: "r".into() })).unwrap();
         drop(ledger);
         assert!(Ledger::open(path.clone()).unwrap().open_entries().is_empty());
         for damaged in [&b"nonsense\n"[..], b"{\"name\": \"\xff\"}\n"] {

@@ -31,7 +31,7 @@ use super::submission::{Recipe, SubmissionArguments};
 use super::verdict;
 use super::wait::wait;
 use engine::job::JobState;
-use ledger::{Entry, Ledger, Shot, Stage};
+use ledger::{Entry, FileState, Ledger, Shot};
 
 /// Extensions of files that may hold snapshots. The service detects the format by the content.
 const ENDINGS: [&str; 10] = ["npy", "npz", "tif", "tiff", "png", "zip", "tar", "mat", "h5", "hdf5"];
@@ -206,7 +206,7 @@ impl Watch<'_> {
             .find(|name| self.is_free(name));
         let results = results.unwrap_or_else(|| shot.name.clone());
         let key = Uuid::now_v7().to_string();
-        self.record(Entry { shot, key, recipe: recipe.clone(), results, stage: Stage::Taken })
+        self.record(Entry { shot, key, recipe: recipe.clone(), results, stage: FileState::Taken })
     }
 
     /// Prints once why a file is not submitted.
@@ -230,9 +230,9 @@ impl Watch<'_> {
     /// Takes the next step for a file.
     async fn advance(&mut self, entry: Entry) -> Result<()> {
         let step = match &entry.stage {
-            Stage::Taken => self.submit(&entry).await,
-            Stage::Submitted { job } => self.fetch(&entry, job).await,
-            Stage::Done { .. } | Stage::Failed { .. } => return Ok(()),
+            FileState::Taken => self.submit(&entry).await,
+            FileState::Submitted { job } => self.fetch(&entry, job).await,
+            FileState::Done { .. } | FileState::Failed { .. } => return Ok(()),
         };
         let stage = match step {
             Ok(None) => return Ok(()),
@@ -250,14 +250,16 @@ impl Watch<'_> {
             }
             // It does not cause a full disk either. The next start downloads the results.
             Err(ClientError::Local(error @ CliError::Failure(_)))
-                if matches!(entry.stage, Stage::Submitted { .. }) =>
+                if matches!(entry.stage, FileState::Submitted { .. }) =>
             {
                 return Err(error);
             }
-            Err(error @ ClientError::Refused { .. }) => Stage::Failed { reason: error.to_string() },
-            Err(ClientError::Local(error)) => Stage::Failed { reason: error.to_string() },
+            Err(error @ ClientError::Refused { .. }) => {
+                FileState::Failed { reason: error.to_string() }
+            }
+            Err(ClientError::Local(error)) => FileState::Failed { reason: error.to_string() },
         };
-        if let Stage::Failed { reason } = &stage {
+        if let FileState::Failed { reason } = &stage {
             self.failed += 1;
             self.write_failure(&entry, reason)?;
         }
@@ -265,10 +267,10 @@ impl Watch<'_> {
         self.record(Entry { stage, ..entry })
     }
 
-    async fn submit(&self, entry: &Entry) -> Result<Option<Stage>, ClientError> {
+    async fn submit(&self, entry: &Entry) -> Result<Option<FileState>, ClientError> {
         let path = self.folder.join(&entry.shot.name);
         let changed = || {
-            Stage::Failed {
+            FileState::Failed {
             reason:
                 "the file was changed or removed during the submission; a changed file is submitted as a new \
                 one"
@@ -285,15 +287,15 @@ impl Watch<'_> {
         self.arguments.submission.send_dark(&self.client).await?;
         let label: String = entry.shot.name.chars().take(200).collect();
         let job = entry.recipe.submit(&self.client, &path, data, Some(&label), &entry.key).await?;
-        Ok(Some(Stage::Submitted { job: Job::new(job)?.id }))
+        Ok(Some(FileState::Submitted { job: Job::new(job)?.id }))
     }
 
-    async fn fetch(&mut self, entry: &Entry, job: &str) -> Result<Option<Stage>, ClientError> {
+    async fn fetch(&mut self, entry: &Entry, job: &str) -> Result<Option<FileState>, ClientError> {
         let job = self.client.job(job, 0).await?;
         if let Some(reason) = job.failure() {
             let findings = verdict::lines(&job.findings());
             let reason = [vec![reason], findings].concat().join("\n");
-            return Ok(Some(Stage::Failed { reason }));
+            return Ok(Some(FileState::Failed { reason }));
         }
         if job.state != JobState::Succeeded {
             return Ok(None);
@@ -301,7 +303,7 @@ impl Watch<'_> {
         let folder = self.folder.join(result_folder(&entry.results));
         self.client.fetch(&job, &self.arguments.files, &folder).await?;
         self.write_report(entry, &job, &folder)?;
-        Ok(Some(Stage::Done { job: job.id }))
+        Ok(Some(FileState::Done { job: job.id }))
     }
 
     /// Prints verdict and findings, and writes them to the results' folder.
@@ -346,10 +348,10 @@ impl Watch<'_> {
             print_line(json!({"file": entry.shot.name, "size": entry.shot.size, "step": state}))?;
         } else {
             let step = match &entry.stage {
-                Stage::Taken => "is being uploaded".to_owned(),
-                Stage::Submitted { job } => format!("is job {job}"),
-                Stage::Done { .. } => format!("is in {}", result_folder(&entry.results)),
-                Stage::Failed { reason } => format!("has failed: {reason}"),
+                FileState::Taken => "is being uploaded".to_owned(),
+                FileState::Submitted { job } => format!("is job {job}"),
+                FileState::Done { .. } => format!("is in {}", result_folder(&entry.results)),
+                FileState::Failed { reason } => format!("has failed: {reason}"),
             };
             print_line(format!("{} {step}", entry.shot.name))?;
         }
@@ -358,19 +360,19 @@ impl Watch<'_> {
 
     /// Runs the command of the user for a file that has ended. The ledger does not name the end yet, so that a kill can't
     /// leave the command out.
-    async fn exec(&self, entry: &Entry, stage: &Stage) {
+    async fn exec(&self, entry: &Entry, stage: &FileState) {
         let job = match &entry.stage {
-            Stage::Submitted { job } => job.clone(),
+            FileState::Submitted { job } => job.clone(),
             _ => String::new(),
         };
         let end = End { job, label: entry.shot.name.clone(), ..End::default() };
         let (end, results) = match stage {
-            Stage::Taken | Stage::Submitted { .. } => return,
-            Stage::Failed { reason } => {
+            FileState::Taken | FileState::Submitted { .. } => return,
+            FileState::Failed { reason } => {
                 let (state, error) = ("failed".to_owned(), reason.clone());
                 (End { state, error, ..end }, failure_file(&entry.results))
             }
-            Stage::Done { .. } => {
+            FileState::Done { .. } => {
                 let verdict = self.results.last().and_then(|job| job.verdict_text.clone());
                 let (state, verdict) = ("succeeded".to_owned(), verdict.unwrap_or_default());
                 (End { state, verdict, ..end }, result_folder(&entry.results))

@@ -197,7 +197,7 @@ mod tests {
 
     use flate2::Crc;
 
-    use super::super::composed::{Piece, Section, Source};
+    use super::super::composed::{FileRange, Piece, Source};
     use super::{Content, Part, parts};
     use engine::job::{ResultFile, Sha256};
 
@@ -205,7 +205,7 @@ mod tests {
         let file = |(index, size): (usize, &u64)| {
             let name = format!("file_{index}");
             let file = ResultFile { name: name.clone(), size: *size, sha256: Sha256::of(b"") };
-            let piece = Piece::File(Section::whole(Source { snapshot: None, file }));
+            let piece = Piece::File(FileRange::whole(Source { snapshot: None, file }));
             (name, Content { pieces: vec![piece], crc32: None })
         };
         sizes.iter().enumerate().map(file).collect()

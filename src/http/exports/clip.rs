@@ -18,7 +18,7 @@ use super::super::error::{ApiError, Code, Result};
 use super::super::extract::{Caller, Params, canonical_number};
 use super::super::jobs::with_snapshot;
 use super::super::results::{attachment, file_name, media_type, result_file};
-use super::composed::{Composed, Content, Part, Piece, Section, Source};
+use super::composed::{Composed, Content, FileRange, Part, Piece, Source};
 use super::format::Format;
 use super::lines::{Compose, Lines};
 use engine::job::{JobId, WrittenFile};
@@ -185,7 +185,7 @@ impl Clip {
                 let make = Arc::new(move |stack: &exr::Stack| derived.head(stack));
                 vec![Piece::Head { source: source.clone(), shape, length, make }, lines]
             }
-            _ => vec![Piece::File(Section::whole(Source { snapshot, file }))],
+            _ => vec![Piece::File(FileRange::whole(Source { snapshot, file }))],
         };
         Ok(Content { pieces, crc32: Some(crc32) })
     }
@@ -210,7 +210,7 @@ impl Clip {
         &self,
         source: &Source,
         frames: Range<usize>,
-        shared: Option<Section>,
+        shared: Option<FileRange>,
         (composed_bytes, compose): (usize, Compose),
     ) -> Result<Piece> {
         let shape = self.job.spec.frame_shape();

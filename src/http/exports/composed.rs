@@ -34,7 +34,7 @@ pub(super) struct Source {
 
 /// A range of bytes of a result file.
 #[derive(Debug, Clone)]
-pub(super) struct Section {
+pub(super) struct FileRange {
     pub(super) source: Source,
     pub(super) start: u64,
     pub(super) length: u64,
@@ -47,7 +47,7 @@ pub(super) type MakeHead = Arc<dyn Fn(&Stack) -> Vec<u8> + Send + Sync>;
 #[derive(Clone)]
 pub(super) enum Piece {
     Bytes(Bytes),
-    File(Section),
+    File(FileRange),
     /// The `length` bytes before the lines of a derived file.
     Head {
         source: Source,
@@ -58,7 +58,7 @@ pub(super) enum Piece {
     /// Lines of a result file, each composed with bytes that all lines share.
     Lines {
         source: Source,
-        shared: Option<Section>,
+        shared: Option<FileRange>,
         lines: Lines,
     },
 }
@@ -198,8 +198,8 @@ impl Piece {
     async fn read(self, app: &App, job: &Job, skip: u64, take: u64) -> io::Result<ByteStream> {
         match self {
             Self::Bytes(bytes) => Ok(slice_stream(&bytes, skip, take)),
-            Self::File(Section { source, start, .. }) => {
-                let section = Section { source, start: start + skip, length: take };
+            Self::File(FileRange { source, start, .. }) => {
+                let section = FileRange { source, start: start + skip, length: take };
                 Ok(section.read(app, job).await?.boxed())
             }
             Self::Head { source, shape, length, make } => {
@@ -221,7 +221,7 @@ impl Piece {
     }
 }
 
-impl Section {
+impl FileRange {
     /// All bytes of a file.
     pub(super) fn whole(source: Source) -> Self {
         let length = source.file.size;

@@ -8,7 +8,7 @@ use axum::response::Response;
 use super::super::error::{ApiError, Result};
 use super::super::results::{attachment, media_type, result_file};
 use super::clip::{Clip, values_offset};
-use super::composed::{Composed, Part, Piece, Section, Source, read_stack};
+use super::composed::{Composed, FileRange, Part, Piece, Source, read_stack};
 use super::lines::Compose;
 use engine::pipeline::assessment::{BLOCK, blocks};
 use engine::pipeline::derived::STACK;
@@ -44,7 +44,7 @@ async fn parts(clip: &Clip) -> Result<Vec<Part>> {
     let composition = (lines.layered_bytes(), compose);
     let part = |k: usize| {
         let start = first + k as u64 * block_bytes;
-        let section = Section { source: errors.clone(), start, length: block_bytes };
+        let section = FileRange { source: errors.clone(), start, length: block_bytes };
         clip.lines(&source, k..k + 1, Some(section), composition.clone()).map(Part::Piece)
     };
     let head = Ok(Part::Piece(Piece::Bytes(head.into())));

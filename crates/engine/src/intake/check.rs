@@ -15,7 +15,7 @@ use formats::mat::SceneArray;
 use formats::planar::Reader;
 use formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use formats::{
-    self, Expected, FormatError, FrameReader, Limits, Part, SampleType, StackInfo, Wanted,
+    self, Expected, FormatError, FrameReader, Limits, SampleType, Selection, StackInfo, Wanted,
 };
 use optics::{BitUsage, Defects, judge_defects, judge_light};
 
@@ -33,13 +33,13 @@ pub struct Exposure {
 
 /// The masks behind which a measurement was taken.
 #[derive(Debug)]
-pub struct Behind {
+pub struct MaskLight {
     /// Sum of the masks \[H,W\]; NaN where the calibration has none.
     pub light: Array2<f32>,
     pub mosaic: Option<Mosaic>,
 }
 
-impl Behind {
+impl MaskLight {
     /// The sum of masks \[B,H,W\] in a prepared file, read one by one.
     ///
     /// Errors: a file that can't be read.
@@ -53,13 +53,6 @@ impl Behind {
         }
         Ok(Self { light, mosaic })
     }
-}
-
-/// The results of reading a measurement.
-#[derive(Debug)]
-pub struct Passed {
-    /// Findings on the bit depth, and on snapshots with pixels that carry no information.
-    pub findings: Vec<Finding>,
 }
 
 /// Reads masks and passes each one \[H,W\] on \[0,1\] to `sink`. Pixels of `bad` \[H,W\] become NaN.
@@ -118,24 +111,25 @@ fn check_count(opened: &Opened) -> Result<()> {
 }
 
 /// Reads a measurement, subtracts the dark frames, divides by the full scale, and passes each snapshot \[H,W\] to
-/// `sink`. Pixels that are saturated, bad or not measured become NaN.
+/// `sink`. Pixels that are saturated, bad or not measured become NaN. Returns findings on the bit depth, and on snapshots
+/// with pixels that carry no information.
 ///
 /// Errors: [`IntakeError::Size`] for dark frames of another size; [`IntakeError::Format`] for unreadable files and
 /// measurements without light, and for errors of `sink`. After an error the output of `sink` is invalid.
 pub fn measurement(
     opened: Opened,
     exposure: &Exposure,
-    behind: &Behind,
+    behind: &MaskLight,
     limits: &Limits,
     sink: impl FnMut(ArrayView2<'_, f32>) -> Result<(), FormatError>,
-) -> Result<Passed> {
+) -> Result<Vec<Finding>> {
     let Opened { info, full_scale, reading, reader, name } = opened;
     let dark = average_dark(&exposure.dark, (info.height, info.width), reading, limits)?;
     let saturation = saturation_level(&info, exposure.saturation);
     let bits = (info.sample == SampleType::U16).then(BitUsage::default);
     #[allow(clippy::cast_precision_loss)] // camera values are small
     let stated = exposure.saturation.map(|level| level as f32);
-    let mut exposed = Exposed { reader, dark, stated, behind, defects: Vec::new(), bits };
+    let mut exposed = CorrectedReader { reader, dark, stated, behind, defects: Vec::new(), bits };
     let dark =
         check_snapshots(&mut exposed, full_scale, sink).map_err(IntakeError::format(name))?;
     let judge = |bits: BitUsage| bits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
@@ -147,7 +141,7 @@ pub fn measurement(
         let finding = Finding::new(FindingCode::EmptySnapshot, format!("the snapshot {state}"));
         Finding { snapshot: u32::try_from(snapshot).ok(), ..finding }
     }));
-    Ok(Passed { findings })
+    Ok(findings)
 }
 
 /// Findings on the snapshots with the most defects, at most [`SNAPSHOTS`] of each kind, in the order of the snapshots.
@@ -185,7 +179,7 @@ fn average_dark(
         return Ok(None);
     }
     let place = |index| format!("/dark/{index}");
-    let part = Part { crop: reading.crop, frames: None };
+    let part = Selection { crop: reading.crop, frames: None };
     let open = |path: &Path| match (reading.crop, reading.packing) {
         (None, None) => formats::open_stack(path, limits),
         (crop, packing) => {
@@ -210,19 +204,19 @@ fn average_dark(
 }
 
 /// A reader that subtracts dark frames and marks pixels without information with NaN.
-struct Exposed<'a> {
+struct CorrectedReader<'a> {
     reader: Box<dyn FrameReader + Send>,
     dark: Option<Array2<f32>>,
     /// Stated value from which a pixel is saturated.
     stated: Option<f32>,
-    behind: &'a Behind,
+    behind: &'a MaskLight,
     /// The defects of each snapshot so far.
     defects: Vec<Defects>,
     /// Bit usage of 16-bit values; `None` for other data types.
     bits: Option<BitUsage>,
 }
 
-impl FrameReader for Exposed<'_> {
+impl FrameReader for CorrectedReader<'_> {
     fn info(&self) -> &StackInfo {
         self.reader.info()
     }
@@ -232,7 +226,7 @@ impl FrameReader for Exposed<'_> {
         if let Some(bits) = &mut self.bits {
             bits.add(&frame);
         }
-        let Behind { light, mosaic } = self.behind;
+        let MaskLight { light, mosaic } = self.behind;
         if frame.dim() == light.dim() {
             let step = if mosaic.is_some() { 2 } else { 1 };
             let how = (step, self.stated);

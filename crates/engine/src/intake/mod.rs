@@ -18,7 +18,7 @@ mod spectral;
 
 pub use bad_pixels::bad_pixels;
 pub use captures::{Calibrated, CaptureFiles, Plan, Progress, Report, calibrate, plan, report};
-pub use check::{Behind, Exposure, Passed, masks, measurement};
+pub use check::{Exposure, MaskLight, masks, measurement};
 pub use error::IntakeError;
 pub use judge::{causes_first, combined, judge};
 pub use open::{Opened, Source};

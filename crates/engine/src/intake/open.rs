@@ -10,8 +10,8 @@ use crate::intake::error::Result;
 use crate::job::{Dispersion, MAX_MASKS, Reading, ScaleBasis};
 use formats::mat::SceneArray;
 use formats::{
-    self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, Packing, Part, SampleType,
-    StackInfo, Wanted,
+    self, Axes, Expected, FormatError, FrameReader, FullScale, Limits, Packing, SampleType,
+    Selection, StackInfo, Wanted,
 };
 
 /// A file, and the array in it if it has several.
@@ -26,7 +26,7 @@ pub struct Source<'a> {
     /// Expected rows and columns of a frame, if known.
     pub size: Option<(usize, usize)>,
     /// The part that is read.
-    pub part: Part,
+    pub part: Selection,
     /// How pixels are packed; `None` for one number per pixel.
     pub packing: Option<Packing>,
     /// Makes the masks of all bands from the only mask of the file.
@@ -68,7 +68,7 @@ impl<'a> Source<'a> {
         limits: Limits,
     ) -> Self {
         let (named, axes, size, name) = (None, None, None, String::new());
-        let (part, packing, dispersion) = (Part::default(), None, None);
+        let (part, packing, dispersion) = (Selection::default(), None, None);
         Self { path, array, named, axes, size, part, packing, dispersion, full_scale, limits, name }
     }
 
@@ -83,7 +83,7 @@ impl<'a> Source<'a> {
     }
 
     /// Selects a part of the file, and states how its pixels are packed.
-    pub fn part(self, part: Part, packing: Option<Packing>) -> Self {
+    pub fn part(self, part: Selection, packing: Option<Packing>) -> Self {
         Self { part, packing, ..self }
     }
 

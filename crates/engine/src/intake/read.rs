@@ -8,9 +8,10 @@ use ndarray::{Array3, ArrayView2, s};
 
 use super::IntakeError;
 use super::bad_pixels::bad_pixels;
-use super::check::{Behind, Exposure, Passed, masks, measurement};
+use super::check::{Exposure, MaskLight, masks, measurement};
 use super::open::{Opened, Source};
 use crate::intake::error::Result;
+use crate::job::Finding;
 use formats::mat::SceneArray;
 use formats::{Axes, Channels, FormatError, natural_key};
 
@@ -45,7 +46,7 @@ pub struct Snapshots {
     /// Number of snapshots in the file.
     pub count: usize,
     /// Findings on these snapshots.
-    pub passed: Passed,
+    pub findings: Vec<Finding>,
 }
 
 /// Reads and checks the snapshots from `first` to `last`, both included, or to the end for `None`.
@@ -54,7 +55,7 @@ pub struct Snapshots {
 pub fn read_snapshots(
     source: &Source<'_>,
     exposure: &Exposure,
-    behind: &Behind,
+    behind: &MaskLight,
     (first, last): (usize, Option<usize>),
 ) -> Result<Snapshots> {
     let opened = source.open()?;
@@ -71,7 +72,7 @@ pub fn read_snapshots(
         return Err(IntakeError::content("", &detail));
     }
     let (mut next, mut selected) = (0, Stack::default());
-    let mut passed = measurement(opened, exposure, behind, &source.limits, |snapshot| {
+    let mut findings = measurement(opened, exposure, behind, &source.limits, |snapshot| {
         if (first..=last).contains(&next) {
             selected.push(snapshot)?;
         }
@@ -79,13 +80,13 @@ pub fn read_snapshots(
         Ok(())
     })?;
     let selects = |snapshot: u32| (first..=last).contains(&(snapshot as usize));
-    passed.findings.retain(|finding| finding.snapshot.is_none_or(selects));
+    findings.retain(|finding| finding.snapshot.is_none_or(selects));
     let measurement = Scaled { array: selected.into_array()?, full_scale, axes };
-    Ok(Snapshots { measurement, count: snapshots, passed })
+    Ok(Snapshots { measurement, count: snapshots, findings })
 }
 
 /// Reads the true frames \[S B,H,W\] of the snapshots `which`, from a file that has those of these snapshots or of all
-/// `snapshots`. `None` if a .mat scene has no truth. Behind a mosaic the truth may be in colour \[S B,H,3W\], as the
+/// `snapshots`. `None` if a .mat scene has no truth. MaskLight a mosaic the truth may be in colour \[S B,H,3W\], as the
 /// returned channels indicate.
 ///
 /// Errors: as [`Source::open`]; [`IntakeError::Size`] for other sizes.

@@ -33,7 +33,7 @@ pub enum Free {
     All,
 }
 
-/// Errors at the hold-out pixels of a piece for 3x3 displacements, which differ from a motion and the displacement `centre`
+/// Errors at the hold-out pixels of a patch for 3x3 displacements, which differ from a motion and the displacement `centre`
 /// by up to one step along each axis.
 pub struct Grid {
     /// Displacement in pixels along rows and columns.

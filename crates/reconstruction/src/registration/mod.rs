@@ -6,20 +6,20 @@
 //! Its ratio to the error of the same masks elsewhere decides how the masks are interpolated.
 //!
 //! The error at a hold-out pixel depends on the displacement there. So the errors on a grid of displacements also give the
-//! derivatives by rotation and growth. These are estimated from several pieces if the errors at a first grid depend on them
-//! significantly, and kept if they predict other pixels significantly better than the mean displacement of the pieces.
+//! derivatives by rotation and growth. These are estimated from several patches if the errors at a first grid depend on them
+//! significantly, and kept if they predict other pixels significantly better than the mean displacement of the patches.
 //!
 //! A correction is accepted only if it lowers the error significantly at pixels that took no part in the search.
 
 mod fit;
 mod interpolated;
-mod pieces;
+mod patches;
 mod quadratic;
 mod similarity;
 
 pub use fit::Uncertainty;
 pub use interpolated::{Interpolated, Interpolation};
-pub use pieces::Plan;
+pub use patches::Plan;
 pub use similarity::{MAX_GROWTH, MAX_ROTATION, REACH, Similarity};
 
 use ndarray::{Array3, ArrayView2, Axis, s};
@@ -27,7 +27,7 @@ use rand::{RngExt, SeedableRng};
 use serde::{Deserialize, Serialize};
 
 use self::fit::{Fit, Free, Grid, SIGNIFICANT, SMALLEST, middle};
-use self::pieces::Place;
+use self::patches::Place;
 use super::error::{ReconError, Result, shape_text};
 use super::hold_out::{HoldOut, t_statistic};
 use super::operator::SensingOperator;
@@ -41,7 +41,7 @@ const SHARE: f64 = 0.1;
 const ITERATIONS: (usize, usize) = (8, 24);
 /// Distances in pixels between the displacements of the first grids of the refinement.
 const STEPS: [f64; 2] = [0.5, 0.25];
-/// Largest number of grids on a piece alone, at each of these distances and at the first of [`LAST_STEPS`].
+/// Largest number of grids on a patch alone, at each of these distances and at the first of [`LAST_STEPS`].
 const LOCAL_GRIDS: [usize; 3] = [3, 2, 3];
 /// Distances in pixels between the displacements of the last grids: each grid is repeated until it has settled.
 const LAST_STEPS: [f64; 3] = [0.125, 0.0625, 0.03125];
@@ -92,9 +92,9 @@ pub struct Registration {
     pub converged: bool,
 }
 
-/// Estimates the motion of masks from the planned pieces of a measurement `y` \[H,W\] on the scale on which the scene is on
+/// Estimates the motion of masks from the planned patches of a measurement `y` \[H,W\] on the scale on which the scene is on
 /// \[0,1\]. NaN were not measured. `masks` reads a window of the masks \[B,h,w\]. `proceed` gets the finished share, and
-/// returns false to stop. `None` if the first piece has no light or no measured pixels, or if its reconstruction diverges.
+/// returns false to stop. `None` if the first patch has no light or no measured pixels, or if its reconstruction diverges.
 ///
 /// # Errors
 /// Sizes that disagree, [`ReconError::Cancelled`], those of [`solver::reconstruct`] and of `masks`.
@@ -104,7 +104,7 @@ pub fn register<E: From<ReconError>>(
     masks: impl Fn(&Window) -> Result<Array3<f32>, E>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Option<Registration>, E> {
-    let read = |place: &Place| Piece::read(plan, place, y, &masks);
+    let read = |place: &Place| Patch::read(plan, place, y, &masks);
     let first = read(&plan.first)?;
     if first.draws.iter().any(|draw| draw.pixels.is_empty()) {
         return Ok(None);
@@ -122,7 +122,7 @@ pub fn register<E: From<ReconError>>(
     if let Some(found) = search.similarity(best, turned, read)? {
         return Ok(Some(found));
     }
-    search.pieces.truncate(1);
+    search.patches.truncate(1);
     let Some((best, fit)) = search.settle(best, Free::Shift)? else { return Ok(None) };
     Ok(search.verdict(best, &fit)?)
 }
@@ -133,14 +133,14 @@ pub struct Known {
     /// Interpolation of the moved masks.
     pub interpolation: Interpolation,
     /// `||y - Hv||^2 / ||y||^2` at hold-out pixels without and with the motion, and whether the masks explain the measurement
-    /// with it, or at least better. `None` if the piece has no light or diverges.
+    /// with it, or at least better. `None` if the patch has no light or diverges.
     pub outcome: Option<([f64; 2], bool)>,
 }
 
 /// A known motion explains a measurement better if it lowers the ratio to the error elsewhere to this share.
 const BETTER: f64 = 0.9;
 
-/// Chooses the interpolation of masks by a known `motion`, and tests this motion, on the first piece as for [`register`].
+/// Chooses the interpolation of masks by a known `motion`, and tests this motion, on the first patch as for [`register`].
 ///
 /// # Errors
 /// Those of [`register`].
@@ -151,7 +151,7 @@ pub fn known<E: From<ReconError>>(
     masks: impl Fn(&Window) -> Result<Array3<f32>, E>,
     proceed: &mut dyn FnMut(f64) -> bool,
 ) -> Result<Known, E> {
-    let first = Piece::read(plan, &plan.first, y, &masks)?;
+    let first = Patch::read(plan, &plan.first, y, &masks)?;
     let mut search = Search::new(plan, first, proceed);
     let interpolation = search.interpolation(motion)?;
     let place = Correction { motion, interpolation };
@@ -186,21 +186,21 @@ fn draw(y: &Array3<f32>) -> [HoldOut; 2] {
     draws.map(|pixels| HoldOut { pixels })
 }
 
-/// A piece of a picture.
-struct Piece {
+/// A patch of a picture.
+struct Patch {
     /// Row and column of the first pixel of the masks on the sensor.
     origin: [usize; 2],
-    /// Masks \[B,h,w\] of the piece with its margin.
+    /// Masks \[B,h,w\] of the patch with its margin.
     masks: Array3<f32>,
     /// The masks by each of [`Interpolation::ALL`].
     interpolated: [Interpolated; 3],
-    /// Measurement \[1,h,w\] of the piece without its margin.
+    /// Measurement \[1,h,w\] of the patch without its margin.
     y: Array3<f32>,
     /// Hold-out pixels of the search, and of the decision.
     draws: [HoldOut; 2],
 }
 
-impl Piece {
+impl Patch {
     fn read<E: From<ReconError>>(
         plan: &Plan,
         place: &Place,
@@ -214,7 +214,7 @@ impl Piece {
             || y.dim() != (plan.sensor[0], plan.sensor[1])
         {
             return Err(E::from(ReconError::Shape {
-                what: "the piece of a registration",
+                what: "the patch of a registration",
                 found: format!("{} of {}", shape_text(masks.shape()), shape_text(y.shape())),
                 expected: format!(
                     "{} of {}",
@@ -273,8 +273,8 @@ impl Piece {
 
 struct Search<'a> {
     plan: &'a Plan,
-    /// The first piece of the plan, and others.
-    pieces: Vec<Piece>,
+    /// The first patch of the plan, and others.
+    patches: Vec<Patch>,
     proceed: &'a mut dyn FnMut(f64) -> bool,
     /// Finished iterations.
     done: f64,
@@ -282,19 +282,19 @@ struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    fn new(plan: &'a Plan, first: Piece, proceed: &'a mut dyn FnMut(f64) -> bool) -> Self {
+    fn new(plan: &'a Plan, first: Patch, proceed: &'a mut dyn FnMut(f64) -> bool) -> Self {
         let interpolations = Interpolation::ALL.len();
         let runs = (STEPS.len() + 2 * MAX_GRIDS + interpolations - 1) * 9 + 4 * interpolations + 3;
         let grids = LOCAL_GRIDS.iter().sum::<usize>();
         let others = plan.others.first().map_or(0, |others| 9 * grids * (1 + others.len()));
         let total = (2 * plan.reach() + 1).pow(2) * ITERATIONS.0 + (runs + others) * ITERATIONS.1;
-        Self { plan, pieces: vec![first], proceed, done: 0.0, total: total as f64 }
+        Self { plan, patches: vec![first], proceed, done: 0.0, total: total as f64 }
     }
 
-    /// Squared errors of one piece; see [`Piece::errors`].
+    /// Squared errors of one patch; see [`Patch::errors`].
     fn errors(
         &mut self,
-        piece: usize,
+        patch: usize,
         correction: Correction,
         draw: usize,
         iterations: usize,
@@ -303,14 +303,14 @@ impl<'a> Search<'a> {
             return Err(ReconError::Cancelled);
         }
         self.done += iterations as f64;
-        self.pieces[piece].errors(self.plan, correction, draw, iterations)
+        self.patches[patch].errors(self.plan, correction, draw, iterations)
     }
 
-    /// Squared errors at the pixels of all pieces on which the decision depends.
+    /// Squared errors at the pixels of all patches on which the decision depends.
     fn deciding_errors(&mut self, correction: Correction) -> Result<Option<Vec<f64>>> {
         let mut all = Vec::new();
-        for piece in 0..self.pieces.len() {
-            let Some(errors) = self.errors(piece, correction, 1, ITERATIONS.1)? else {
+        for patch in 0..self.patches.len() {
+            let Some(errors) = self.errors(patch, correction, 1, ITERATIONS.1)? else {
                 return Ok(None);
             };
             all.extend(errors);
@@ -320,10 +320,10 @@ impl<'a> Search<'a> {
 
     /// The sum of squares of the measurement at these pixels.
     fn norm(&self) -> f64 {
-        self.pieces.iter().map(|piece| piece.draws[1].norm(piece.y.view())).sum()
+        self.patches.iter().map(|patch| patch.draws[1].norm(patch.y.view())).sum()
     }
 
-    /// The shift by whole pixels with the smallest error of the first piece.
+    /// The shift by whole pixels with the smallest error of the first patch.
     fn whole_pixels(&mut self) -> Result<Option<Correction>> {
         let reach = self.plan.reach() as i32;
         let mut best: Option<(f64, Correction)> = None;
@@ -341,7 +341,7 @@ impl<'a> Search<'a> {
         Ok(best.map(|(_, place)| place))
     }
 
-    /// The interpolation with the smallest error of the first piece relative to that of the same masks elsewhere, since a
+    /// The interpolation with the smallest error of the first patch relative to that of the same masks elsewhere, since a
     /// loss of contrast lowers both. Shifts by whole pixels have the default: none is better there.
     fn interpolation(&mut self, motion: Similarity) -> Result<Interpolation> {
         let mut best = (f64::INFINITY, Interpolation::default());
@@ -357,13 +357,13 @@ impl<'a> Search<'a> {
         Ok(best.1)
     }
 
-    /// The error of the first `count` pieces relative to that of the same masks elsewhere; infinite if they are dark or the
+    /// The error of the first `count` patches relative to that of the same masks elsewhere; infinite if they are dark or the
     /// solver diverges.
     fn ratio(&mut self, count: usize, place: Correction) -> Result<f64> {
         let mut sums = [0.0; 2];
-        for piece in 0..count {
+        for patch in 0..count {
             for (sum, place) in sums.iter_mut().zip([place, place.elsewhere()]) {
-                let Some(errors) = self.errors(piece, place, 0, ITERATIONS.1)? else {
+                let Some(errors) = self.errors(patch, place, 0, ITERATIONS.1)? else {
                     return Ok(f64::INFINITY);
                 };
                 *sum += errors.iter().sum::<f64>();
@@ -372,13 +372,13 @@ impl<'a> Search<'a> {
         Ok(sums[0] / sums[1])
     }
 
-    /// Estimates rotation and growth too, after the first piece has given a shift and, `turned`, all parameters. `None` if
+    /// Estimates rotation and growth too, after the first patch has given a shift and, `turned`, all parameters. `None` if
     /// they are not significant, or if they predict other pixels no better than a shift.
     fn similarity<E: From<ReconError>>(
         &mut self,
         mut best: Correction,
         turned: Fit,
-        read: impl Fn(&Place) -> Result<Piece, E>,
+        read: impl Fn(&Place) -> Result<Patch, E>,
     ) -> Result<Option<Registration>, E> {
         let fine = LAST_STEPS[0];
         let plan = self.plan;
@@ -387,22 +387,22 @@ impl<'a> Search<'a> {
             best.motion = turned.minimum;
         }
         for places in &plan.others {
-            self.pieces.truncate(1);
+            self.patches.truncate(1);
             for place in places {
-                self.pieces.push(read(place)?);
+                self.patches.push(read(place)?);
             }
-            if self.pieces.len() == 1 {
+            if self.patches.len() == 1 {
                 break;
             }
             let mut grids = Vec::new();
-            while grids.len() < self.pieces.len() {
+            while grids.len() < self.patches.len() {
                 match self.local_grid(grids.len(), best)? {
                     Some(grid) => grids.push(grid),
                     None if grids.is_empty() => return Ok(None),
-                    None => drop(self.pieces.remove(grids.len())),
+                    None => drop(self.patches.remove(grids.len())),
                 }
             }
-            // Farther pieces show rotations that are too small for neighbours.
+            // Farther patches show rotations that are too small for neighbours.
             let fit = self.fit(best, &grids, fine, Free::All);
             if fit.has_turned {
                 has_turned = true;
@@ -417,7 +417,7 @@ impl<'a> Search<'a> {
             return Ok(None);
         };
         let places: Vec<_> =
-            self.pieces.iter().flat_map(|piece| piece.places(plan.margin)).collect();
+            self.patches.iter().flat_map(|patch| patch.places(plan.margin)).collect();
         let shift = best.motion.displacement(plan.sensor, middle(&places));
         let shifted = Correction { motion: Similarity::shifted(shift), ..best };
         let errors = (self.deciding_errors(shifted)?, self.deciding_errors(best)?);
@@ -425,14 +425,14 @@ impl<'a> Search<'a> {
         Ok((t_statistic(&shifted, &turned) >= SIGNIFICANT).then_some(found))
     }
 
-    /// The errors of a piece on a fine grid around the displacement that fits it alone, since the errors behind sharp masks are
+    /// The errors of a patch on a fine grid around the displacement that fits it alone, since the errors behind sharp masks are
     /// no quadratic half a pixel away. `None` if it has no light.
-    fn local_grid(&mut self, piece: usize, best: Correction) -> Result<Option<Grid>> {
+    fn local_grid(&mut self, patch: usize, best: Correction) -> Result<Option<Grid>> {
         let mut local = best;
         let mut last = None;
         for (step, count) in [STEPS[0], STEPS[1], LAST_STEPS[0]].into_iter().zip(LOCAL_GRIDS) {
             for _ in 0..count {
-                let Some(grid) = self.grid(piece, local, step)? else { return Ok(None) };
+                let Some(grid) = self.grid(patch, local, step)? else { return Ok(None) };
                 let centre = [0, 1].map(|axis| local.motion.shift[axis] - best.motion.shift[axis]);
                 let fit = self.fit(local, std::slice::from_ref(&grid), step, Free::Shift);
                 local.motion = fit.minimum;
@@ -452,7 +452,7 @@ impl<'a> Search<'a> {
         if settled.0.motion.is_whole() {
             return Ok(Some(settled));
         }
-        let count = self.pieces.len();
+        let count = self.patches.len();
         let (mut smallest, mut better) = (self.ratio(count, settled.0)?, None);
         for interpolation in Interpolation::ALL {
             let mut other = Correction { interpolation, ..settled.0 };
@@ -461,7 +461,7 @@ impl<'a> Search<'a> {
             }
             let Some(grids) = self.grids(other, LAST_STEPS[0])? else { continue };
             other.motion = self.fit(other, &grids, LAST_STEPS[0], free).minimum;
-            let ratio = self.ratio(self.pieces.len(), other)?;
+            let ratio = self.ratio(self.patches.len(), other)?;
             if ratio < smallest {
                 (smallest, better) = (ratio, Some(other));
             }
@@ -536,21 +536,21 @@ impl<'a> Search<'a> {
         Ok(Some((mean - error) / variance.sqrt()))
     }
 
-    /// The errors of each piece on a grid around the best motion. Pieces without light are left out. `None` if this is the
+    /// The errors of each patch on a grid around the best motion. Patches without light are left out. `None` if this is the
     /// first one.
     fn grids(&mut self, best: Correction, step: f64) -> Result<Option<Vec<Grid>>> {
         let mut grids = Vec::new();
-        while grids.len() < self.pieces.len() {
+        while grids.len() < self.patches.len() {
             match self.grid(grids.len(), best, step)? {
                 Some(grid) => grids.push(grid),
                 None if grids.is_empty() => return Ok(None),
-                None => drop(self.pieces.remove(grids.len())),
+                None => drop(self.patches.remove(grids.len())),
             }
         }
         Ok(Some(grids))
     }
 
-    fn grid(&mut self, piece: usize, best: Correction, step: f64) -> Result<Option<Grid>> {
+    fn grid(&mut self, patch: usize, best: Correction, step: f64) -> Result<Option<Grid>> {
         let limit = (self.plan.reach() + 1) as f64;
         let [rows, columns] = best.motion.shift;
         let mut grid = Vec::with_capacity(9);
@@ -559,12 +559,12 @@ impl<'a> Search<'a> {
             let shift = [rows + step * row, columns + step * column];
             let shift = shift.map(|value| value.clamp(-limit, limit));
             let motion = Similarity { shift, ..best.motion };
-            match self.errors(piece, Correction { motion, ..best }, 0, ITERATIONS.1)? {
+            match self.errors(patch, Correction { motion, ..best }, 0, ITERATIONS.1)? {
                 Some(errors) => grid.push(errors),
                 None => return Ok(None),
             }
         }
-        let places = self.pieces[piece].places(self.plan.margin).collect();
+        let places = self.patches[patch].places(self.plan.margin).collect();
         Ok(Some(Grid { centre: [0.0; 2], places, errors: grid }))
     }
 
@@ -575,7 +575,7 @@ impl<'a> Search<'a> {
 
 #[cfg(test)]
 mod tests {
-    use super::pieces::MARGIN;
+    use super::patches::MARGIN;
     use super::{Interpolated, Interpolation, Plan, Registration, Similarity, register};
     use crate::error::Result;
     use crate::tile::Window;
@@ -740,9 +740,9 @@ mod tests {
             let expected = whole.window(&source, rows.clone(), columns.clone());
             let margin = motion.margin(sensor, &rows, &columns);
             assert!(margin <= MARGIN, "{margin}");
-            let piece = masks.slice(s![.., 30 - margin..50 + margin, 30 - margin..60 + margin]);
+            let patch = masks.slice(s![.., 30 - margin..50 + margin, 30 - margin..60 + margin]);
             let source = motion.source(sensor, [30 - margin; 2]);
-            let found = Interpolated::new(piece, interpolation).window(
+            let found = Interpolated::new(patch, interpolation).window(
                 &source,
                 margin..margin + 20,
                 margin..margin + 30,

@@ -128,7 +128,7 @@ pub struct TileBeat {
 
 /// Asks for an input that the worker can't fetch.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
-pub struct Want {
+pub struct InputRequest {
     pub task: TaskId,
     pub sha256: Sha256,
 }

@@ -21,8 +21,8 @@ use super::blobs::BlobError;
 use super::cache::Cache;
 use super::connection::{Access, ClusterError, Connection, Credential};
 use super::message::{
-    Beat, Begin, BeginAnswer, End, Event, Hello, HelloAnswer, Input, Notice, Program, TaskMessage,
-    TileBeat, Want,
+    Beat, Begin, BeginAnswer, End, Event, Hello, HelloAnswer, Input, InputRequest, Notice, Program,
+    TaskMessage, TileBeat,
 };
 use super::{arrays, names};
 use crate::transport::{Claim, Done, Output, TaskInput, TileTask, Transport, TransportError};
@@ -542,7 +542,7 @@ impl Remote {
             // The first failure may be due to a replica that lags.
             if missing % 4 == 2 {
                 tracing::warn!(%error, sha256 = %input.sha256, "an input is requested again");
-                let want = Want { task: held.task.task, sha256: input.sha256 };
+                let want = InputRequest { task: held.task.task, sha256: input.sha256 };
                 if let Err(error) = self.send("want", &want).await {
                     tracing::warn!(%error, "an input can't be requested");
                 }

@@ -133,12 +133,12 @@ impl Core {
         let masks = match self.window(&tile) {
             Some(known) if self.is_put(pool, known.sha256) => known,
             _ => {
-                let input = self.put_input(pool, self.cut(&tile, Part::Masks).await?).await?;
+                let input = self.put_input(pool, self.cut(&tile, InputArray::Masks).await?).await?;
                 self.note_window(&tile, input);
                 input
             }
         };
-        let snapshots = self.put_input(pool, self.cut(&tile, Part::Snapshots).await?).await?;
+        let snapshots = self.put_input(pool, self.cut(&tile, InputArray::Snapshots).await?).await?;
         self.note_snapshots(claimed.lease.task, pool, snapshots.sha256);
         let model = match tile.model {
             Some(sha256) => Some(self.put_model(pool, sha256).await?),
@@ -150,16 +150,16 @@ impl Core {
     }
 
     /// Cuts a window of a prepared array, and serializes it.
-    async fn cut(&self, task: &TileTask, part: Part) -> Result<Vec<u8>, PipelineError> {
-        let sha256 = if part == Part::Masks { task.masks } else { task.measurement };
+    async fn cut(&self, task: &TileTask, part: InputArray) -> Result<Vec<u8>, PipelineError> {
+        let sha256 = if part == InputArray::Masks { task.masks } else { task.measurement };
         let (path, task) = (self.store.dir().blob(&sha256), task.clone());
         let cut = tokio::task::spawn_blocking(move || {
             let array = Reader::open(&path, &Limits::default())?;
             let place = task.tile.window();
             let frames = task.snapshots.start as usize..task.snapshots.end as usize;
             let window = match part {
-                Part::Masks => mask_window(&array, &place, task.correction),
-                Part::Snapshots => snapshot_window(&array, frames, &place, task.correction),
+                InputArray::Masks => mask_window(&array, &place, task.correction),
+                InputArray::Snapshots => snapshot_window(&array, frames, &place, task.correction),
             };
             arrays::to_bytes(window?.view())
         });
@@ -230,7 +230,7 @@ impl Core {
 
 /// The array from which a window is cut.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Part {
+enum InputArray {
     Masks,
     Snapshots,
 }

@@ -15,7 +15,9 @@ use super::error::HubError;
 use super::figures;
 use super::presence::MAX_WORKERS;
 use crate::nats::connection::ClusterError;
-use crate::nats::message::{Beat, Begin, BeginAnswer, Hello, HelloAnswer, Notice, TileBeat, Want};
+use crate::nats::message::{
+    Beat, Begin, BeginAnswer, Hello, HelloAnswer, InputRequest, Notice, TileBeat,
+};
 use crate::nats::names;
 use engine::job::Pool;
 use engine::pipeline::progress::is_history;
@@ -64,7 +66,7 @@ impl Core {
     }
 
     pub async fn answer_wants(self: Arc<Self>, messages: Subscriber) {
-        each(messages, |pool, want: Want, _| {
+        each(messages, |pool, want: InputRequest, _| {
             let hub = self.clone();
             async move {
                 match hub.store.remote_task(want.task).await {

@@ -44,7 +44,7 @@ impl FromStr for Crop {
 
 /// The part of a stack that is read.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Part {
+pub struct Selection {
     /// The window of each frame; `None` for whole frames.
     pub crop: Option<Crop>,
     /// First and last frame, both included, counted from 0; `None` for all frames.
@@ -68,7 +68,7 @@ const PAIR_BYTES: usize = 3;
 /// Largest value of 12 bits.
 const LARGEST: f32 = 4095.0;
 
-impl Part {
+impl Selection {
     /// Limits a stack to this part.
     ///
     /// Errors: [`FormatError::Part`] for a part outside the stack.
@@ -216,7 +216,7 @@ impl Packing {
 mod tests {
     use ndarray::{Array3, s};
 
-    use super::{Crop, Packing, Part};
+    use super::{Crop, Packing, Selection};
     use crate::mat::SceneArray;
     use crate::test_support::{assert_names, file, ramp};
     use crate::{
@@ -239,19 +239,19 @@ mod tests {
     fn a_window_and_a_range_of_frames_are_selected() {
         let (stack, bytes) = stack();
         let crop = Crop { row: 1, column: 2, height: 4, width: 6 };
-        let part = Part { crop: Some(crop), frames: Some([1, 3]) };
+        let part = Selection { crop: Some(crop), frames: Some([1, 3]) };
         let (info, found) = open(&bytes, Wanted { part, ..SceneArray::Masks.into() }).unwrap();
         assert_eq!((info.frames, info.height, info.width), (3, 4, 6));
         assert_eq!(found, stack.slice(s![1..4, 1..5, 2..8]));
         for (part, words) in [
-            (Part { crop: Some(Crop { row: 3, ..crop }), frames: None }, ["4x6", "6x8"]),
-            (Part { crop: Some(Crop { width: 0, ..crop }), frames: None }, ["4x0", "6x8"]),
+            (Selection { crop: Some(Crop { row: 3, ..crop }), frames: None }, ["4x6", "6x8"]),
+            (Selection { crop: Some(Crop { width: 0, ..crop }), frames: None }, ["4x0", "6x8"]),
             (
-                Part { crop: Some(Crop { column: usize::MAX, ..crop }), frames: None },
+                Selection { crop: Some(Crop { column: usize::MAX, ..crop }), frames: None },
                 ["4x6", "6x8"],
             ),
-            (Part { crop: None, frames: Some([2, 5]) }, ["frames 2 to 5", "5 frames"]),
-            (Part { crop: None, frames: Some([2, 1]) }, ["frames 2 to 1", "5 frames"]),
+            (Selection { crop: None, frames: Some([2, 5]) }, ["frames 2 to 5", "5 frames"]),
+            (Selection { crop: None, frames: Some([2, 1]) }, ["frames 2 to 1", "5 frames"]),
         ] {
             let error = open(&bytes, Wanted { part, ..SceneArray::Masks.into() }).unwrap_err();
             assert!(matches!(error, FormatError::Part { .. }), "{error:?}");

@@ -1,4 +1,4 @@
-//! The pieces of a picture on which masks are registered.
+//! The patches of a picture on which masks are registered.
 
 use std::ops::Range;
 
@@ -8,31 +8,31 @@ use super::similarity::{MAX_GROWTH, MAX_ROTATION, REACH, Similarity};
 use crate::crop;
 use crate::tile::Window;
 
-/// Pixels around a piece that the interpolation of its masks needs where all of them move by at most [`REACH`].
+/// Pixels around a patch that the interpolation of its masks needs where all of them move by at most [`REACH`].
 pub(super) const MARGIN: usize = 16 + REACH + 1;
 /// Pixels of this margin that a small rotation may use: the spline's filter has nearly vanished there.
 const SPARE: f64 = 2.0;
-/// Shortest side in pixels of a piece.
+/// Shortest side in pixels of a patch.
 pub(super) const SHORTEST_SIDE: usize = 32;
-/// Largest distance in pixels from the first piece to the end of its neighbours. A rotation that these have found predicts
+/// Largest distance in pixels from the first patch to the end of its neighbours. A rotation that these have found predicts
 /// their displacements [`FARTHER`] times as far away within a fraction of a pixel.
 const FIRST_REACH: usize = 128;
-/// Ratio of the distances of pieces from step to step.
+/// Ratio of the distances of patches from step to step.
 const FARTHER: usize = 5;
 
-/// The places of the pieces.
+/// The places of the patches.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// Rows and columns of the picture.
     pub(super) sensor: [usize; 2],
     pub(super) margin: usize,
-    /// The piece with the most structure.
+    /// The patch with the most structure.
     pub(super) first: Place,
-    /// Other pieces, each list farther away than the one before.
+    /// Other patches, each list farther away than the one before.
     pub(super) others: Vec<Vec<Place>>,
 }
 
-/// Rows and columns of a piece.
+/// Rows and columns of a patch.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Place {
     pub(super) rows: Range<usize>,
@@ -40,7 +40,7 @@ pub(super) struct Place {
 }
 
 impl Place {
-    /// The piece with a margin.
+    /// The patch with a margin.
     pub(super) fn window(&self, margin: usize) -> Window {
         let around = |range: &Range<usize>| range.start - margin..range.end + margin;
         Window { rows: around(&self.rows), columns: around(&self.columns), step: 1 }
@@ -53,7 +53,7 @@ fn largest(distance: f64) -> f64 {
 }
 
 impl Plan {
-    /// Selects pieces in a measurement `y` \[H,W\] behind masks with the sum `light` \[H,W\]: each is a crop as
+    /// Selects patches in a measurement `y` \[H,W\] behind masks with the sum `light` \[H,W\]: each is a crop as
     /// [`crop::choose`] selects it. `None` if the picture is too small.
     pub fn choose(light: ArrayView2<'_, f32>, y: ArrayView2<'_, f32>) -> Option<Self> {
         let (height, width) = y.dim();
@@ -73,13 +73,13 @@ impl Plan {
         };
         let first = crop(&inner[0], &inner[1]);
         let sides = [(&first.rows, &inner[0]), (&first.columns, &inner[1])];
-        let rooms = sides.map(|(piece, inner)| room(piece, inner).len());
+        let rooms = sides.map(|(patch, inner)| room(patch, inner).len());
         let mut others = Vec::new();
         let mut reach = FIRST_REACH;
         loop {
             let is_last = rooms.iter().all(|room| *room <= 2 * reach);
-            let [rows, columns] = sides.map(|(piece, inner)| {
-                far(room(piece, inner), piece, if is_last { usize::MAX } else { reach })
+            let [rows, columns] = sides.map(|(patch, inner)| {
+                far(room(patch, inner), patch, if is_last { usize::MAX } else { reach })
             });
             let mut places = Vec::new();
             places.extend(rows.as_ref().map(|rows| crop(rows, &first.columns)));
@@ -94,7 +94,7 @@ impl Plan {
         Some(Self { sensor: [height, width], margin, first, others })
     }
 
-    /// Largest displacement in whole pixels of the first piece.
+    /// Largest displacement in whole pixels of the first patch.
     pub(super) fn reach(&self) -> usize {
         let centre = |range: &Range<usize>| (range.start + range.end) as f64 / 2.0;
         let [height, width] = self.sensor.map(|side| side as f64 / 2.0);
@@ -112,17 +112,17 @@ impl Plan {
     }
 }
 
-/// The longer of the two ranges before and after a piece.
-fn room(piece: &Range<usize>, inner: &Range<usize>) -> Range<usize> {
-    let (before, after) = (inner.start..piece.start, piece.end..inner.end);
+/// The longer of the two ranges before and after a patch.
+fn room(patch: &Range<usize>, inner: &Range<usize>) -> Range<usize> {
+    let (before, after) = (inner.start..patch.start, patch.end..inner.end);
     if before.len() > after.len() { before } else { after }
 }
 
-/// The part of a range that is farthest from a piece, up to `reach` pixels away. `None` if it is too short.
-fn far(room: Range<usize>, piece: &Range<usize>, reach: usize) -> Option<Range<usize>> {
+/// The part of a range that is farthest from a patch, up to `reach` pixels away. `None` if it is too short.
+fn far(room: Range<usize>, patch: &Range<usize>, reach: usize) -> Option<Range<usize>> {
     let length = room.len().min(reach);
     let part = length.min(crop::SIDE.max(length / 3));
-    let range = if room.start < piece.start {
+    let range = if room.start < patch.start {
         room.end - length..room.end - length + part
     } else {
         room.start + length - part..room.start + length
