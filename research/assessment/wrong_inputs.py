@@ -355,7 +355,7 @@ KINDS = [
     Kind('right: steady motion, random squares', (), right, RIGHT, 'squares'),
     Kind('right: grey masks', (), right, RIGHT, 'grey'),
     Kind('right: static scene', (), right, RIGHT, 'static'),
-    Kind('right: masks with a constant sum', ('unfamiliar_masks', 'unverified_masks'), right, RIGHT, 'balanced'),
+    Kind('right: masks with a constant sum', ('unfamiliar_masks',), right, RIGHT, 'balanced'),
     Kind('right: noise of sigma 50', (), noisy, RIGHT),
     Kind('right: clips', ('fast_motion',), right, RIGHT, 'filmed'),
 
@@ -397,7 +397,7 @@ KINDS = [
     Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
 
     Kind('masks of another calibration', ('foreign_masks',), with_masks(lambda s: s.other), masks=True),
-    Kind('masks of another calibration, masks with a constant sum', ('foreign_masks', 'unverified_masks'), with_masks(lambda s: s.other), HIDDEN, 'balanced', masks=True),
+    Kind('masks of another calibration, masks with a constant sum', ('foreign_masks',), with_masks(lambda s: s.other), HIDDEN, 'balanced', masks=True),
     Kind('inverted masks (1 - C)', ('inverted_masks',), with_masks(lambda s: 1 - s.masks), masks=True),
     Kind('masks flipped from left to right', ('turned_masks',), with_masks(lambda s: s.masks[:, :, ::-1]), masks=True),
     Kind('masks flipped upside down', ('turned_masks',), with_masks(lambda s: s.masks[:, ::-1]), masks=True),

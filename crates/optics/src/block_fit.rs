@@ -26,6 +26,9 @@ const MIN_ENERGY: f64 = 0.01;
 /// simulated ones with more than ten lit blocks, right masks exceed a share of 0.2, and turned masks and those of another
 /// camera stay below 0.14.
 const MIN_GAIN: f64 = 0.15;
+/// Masks of another place are no comparison if their sum correlates by this much with that of the block, as that of
+/// periodic masks does.
+const MAX_LIKENESS: f32 = 0.5;
 /// Standard errors of a sure statement.
 const SURE: f64 = 3.0;
 /// Masks are recognised if their gain exceeds that limit by this many standard errors.
@@ -98,7 +101,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 }
 
 impl Pixels {
-    /// The block of a window that begins at this row and column; `None` if too few pixels were measured.
+    /// The pixels of the block of a window that begins at this row and column; `None` if too few were measured.
     fn new(window: &Window<'_>, (row, column): (usize, usize)) -> Option<Self> {
         let side = 0..BLOCK_MARGIN;
         let all = side.clone().flat_map(|i| side.clone().map(move |j| (i, j)));
@@ -154,6 +157,7 @@ fn subtract(values: &mut [f32], function: &[f32]) {
 }
 
 impl Window<'_> {
+    /// `None` if too few pixels were measured, or if masks of other places resemble those of the block.
     fn block(&self, place: (usize, usize)) -> Option<Block> {
         let pixels = Pixels::new(self, place)?;
         let (light, open) = (pixels.values(self.y, (0, 0)), pixels.values(self.sum.view(), (0, 0)));
@@ -194,10 +198,21 @@ impl Window<'_> {
             (correlations.dot(&light) / energy).clamp(0.0, 1.0)
         };
         let side = BLOCK_MARGIN as i32;
-        let around = [(0, side), (0, -side), (side, 0), (-side, 0)];
+        let is_other = |shift: &(i32, i32)| {
+            let other = pixels.values(self.sum.view(), *shift);
+            let other = pixels
+                .fine(other.into_iter().map(|sum| if sum.is_nan() { 0.0 } else { sum }).collect());
+            dot(&open, &other).abs()
+                < MAX_LIKENESS * (dot(&open, &open) * dot(&other, &other)).sqrt()
+        };
+        let around = [(0, side), (0, -side), (side, 0), (-side, 0)].into_iter().filter(is_other);
+        let elsewhere: Vec<f64> = around.map(explained).collect();
+        if elsewhere.is_empty() {
+            return None;
+        }
         Some(Block {
             energy,
-            elsewhere: around.map(explained).iter().sum::<f64>() / 4.0,
+            elsewhere: elsewhere.iter().sum::<f64>() / elsewhere.len() as f64,
             explained: shifts().map(explained).collect(),
             expected: (f64::from(ratio * ratio * dot(&open, &open)) / energy).min(1.0),
         })
@@ -277,7 +292,7 @@ impl BlockStudy {
 pub fn judge_blocks(fit: Option<&BlockFit>) -> Option<Finding> {
     let Some(fit) = fit else {
         return Some(unverified(
-            "no block of 16x16 pixels has masks around it and enough light".to_owned(),
+            "no block of 16x16 pixels has enough light and other masks around it".to_owned(),
         ));
     };
     let percent = |share: f64| 100.0 * share.max(0.0);
@@ -389,6 +404,12 @@ mod tests {
             let inverted = mask.mapv(|value| 1.0 - value);
             assert_eq!(code(inverted.view(), &y), Some("foreign_masks"), "noise {noise}");
         }
+    }
+
+    #[test]
+    fn periodic_masks_have_no_comparison() {
+        let mask = Array2::from_shape_fn((192, 192), |(i, j)| f32::from((i * 5 + j) % 16 < 4));
+        assert_eq!(code(mask.view(), &measurement(mask.view())), Some("unverified_masks"));
     }
 
     #[test]

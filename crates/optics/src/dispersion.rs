@@ -130,6 +130,13 @@ impl Dispersion {
         self.offsets.len()
     }
 
+    /// True if two bands are less than half a pixel apart. Their masks resemble one another too much to tell them apart.
+    pub fn has_close_bands(&self) -> bool {
+        let mut offsets = self.offsets.clone();
+        offsets.sort_by(f64::total_cmp);
+        offsets.windows(2).any(|pair| pair[1] - pair[0] < 0.5)
+    }
+
     /// Wavelength of a band in nanometres, if known.
     pub fn wavelength(&self, band: usize) -> Option<f64> {
         self.wavelengths.as_ref()?.get(band).copied()

@@ -292,6 +292,7 @@ impl FindingCode {
             | Self::TurnedMasks
             | Self::UnexplainedPixels
             | Self::UnmodulatedArea
+            | Self::UnverifiedMasks
             | Self::WrongDark => Some(Doubt::Inputs),
             Self::LeftAligned | Self::Level | Self::RightAligned => Some(Doubt::Scale),
             _ => None,

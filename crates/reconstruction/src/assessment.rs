@@ -398,8 +398,10 @@ const APERTURE_SHARPNESS: f32 = 0.28;
 /// through closed pixels, until they are at least as highly correlated as those of the hybrid coded aperture.
 fn unfamiliar_masks(features: &Array3<BlockFeatures>) -> bool {
     let blocks = features.index_axis(Axis(0), 0);
-    // A block that no light reaches has no contrast.
-    let lit = || blocks.iter().filter(|block| block.mask_contrast > logarithm(0.0));
+    // A block that no light reaches has neither contrast nor gradient. Equal masks have no contrast.
+    let is_lit =
+        |block: &&BlockFeatures| block.mask_contrast.max(block.mask_gradient) > logarithm(0.0);
+    let lit = || blocks.iter().filter(is_lit);
     let mean =
         |value: fn(&BlockFeatures) -> f32| lit().map(value).sum::<f32>() / lit().count() as f32;
     let contrast = mean(|block| block.mask_contrast);

@@ -27,9 +27,9 @@ const SNAPSHOTS: usize = 8;
 /// ones, which looks like light that the masks do not explain.
 pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding> {
     use FindingCode::{
-        BadPixels, BinaryMeasurement, DriftedMasks, ForeignMasks, InvertedMasks, Level, MaskScale,
-        MaskValues, MissingMask, NegativeOffset, NoDark, PartlyMovedMasks, ResampledMasks,
-        Saturated, ShiftedMasks, TurnedMasks, WrongDark,
+        BadPixels, BinaryMeasurement, DriftedMasks, EmptySnapshot, ForeignMasks, InvertedMasks,
+        Level, MaskScale, MaskValues, MissingMask, NegativeOffset, NoDark, PartlyMovedMasks,
+        ResampledMasks, Saturated, ShiftedMasks, TurnedMasks, UnverifiedMasks, WrongDark,
     };
     let is_one_of =
         |finding: &Finding, codes: &[FindingCode]| codes.iter().any(|code| finding.is(*code));
@@ -57,6 +57,8 @@ pub fn combined(mut read: Vec<Finding>, mut judged: Vec<Finding>) -> Vec<Finding
         _ => true,
     });
     let saturated = snapshots_with(&read, &[Saturated]);
+    let empty = snapshots_with(&read, &[EmptySnapshot]);
+    judged.retain(|finding| !(finding.is(UnverifiedMasks) && empty.contains(&finding.snapshot)));
     let offsets = [DriftedMasks, NoDark, NegativeOffset, WrongDark, Level, MaskValues, MissingMask];
     judged
         .retain(|finding| !(is_one_of(finding, &offsets) && saturated.contains(&finding.snapshot)));
@@ -99,11 +101,16 @@ pub fn judge(
     for sample in 0..count.min(SNAPSHOTS) {
         let snapshot = sample * count / count.min(SNAPSHOTS);
         let studied = study(files, snapshot, mosaic, Turn::default())?;
-        let Some(mut figures) = studied.finish() else { continue };
+        let number = u32::try_from(snapshot).ok();
+        let Some(mut figures) = studied.finish() else {
+            let detail = "the picture is too small, too little of it was measured, or the masks have no structure";
+            let finding = optics::Finding::new(FindingCode::UnverifiedMasks, detail);
+            findings.push(Finding { snapshot: number, ..Finding::from(finding) });
+            continue;
+        };
         if let Some(part) = figures.unmodulated.as_mut().filter(|_| mosaic.is_some()) {
             part.place = part.place.map(|at| 2 * at);
         }
-        let number = u32::try_from(snapshot).ok();
         let mut judged = match dispersion {
             Some(_) => judge_dispersed(&figures, dark_subtracted),
             None => judge_measurement(&figures, dark_subtracted),

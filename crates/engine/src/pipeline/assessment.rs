@@ -4,7 +4,9 @@
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
 
-use crate::job::{Assessment, Finding, FindingCode, Grade, MaskOrder, withholds_quality};
+use crate::job::{
+    Assessment, Dispersion, Finding, FindingCode, Grade, MaskOrder, withholds_quality,
+};
 pub use reconstruction::assessment::{BLOCK, blocks};
 use reconstruction::assessment::{Coverage, Evidence};
 use reconstruction::hold_out::Prediction;
@@ -143,12 +145,12 @@ pub struct Expected {
 
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
 /// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
-/// of the PSNR. With `spectral` frames are bands, which neither move nor have an order in time. A snapshot without light gets
+/// of the PSNR. With a dispersion, frames are `bands`, which neither move nor have an order in time. A snapshot without light gets
 /// no figures. `None` if a tile has none.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
-    (schedule, spectral): (&Schedule, bool),
+    (schedule, bands): (&Schedule, Option<&Dispersion>),
     (frames, normalisation, white_level): (usize, f32, f32),
     warnings: &[Finding],
 ) -> Option<Expected> {
@@ -158,13 +160,14 @@ pub fn expected(
     let mut squares = Array3::<f64>::zeros((frames, rows, columns));
     let (mut unmeasured, mut open) = (squares.clone(), squares.clone());
     let block_centre = |index: usize, length: usize| (index * BLOCK + BLOCK / 2).min(length - 1);
-    let (mut lit, mut motion, mut unfamiliar) = (false, 0.0f32, false);
+    let (mut lit, mut motion) = (false, 0.0f32);
+    let mut unfamiliar = bands.is_some_and(Dispersion::has_close_bands);
     let (mut predictions, mut orders) = (Vec::new(), Vec::new());
     for (share, tiles) in shares {
         for (tile, assessed) in plan.tiles().zip(tiles) {
             let assessed = assessed.as_ref()?;
             lit |= (0..frames).any(|k| assessed.is_lit(share.frame(k)));
-            if !spectral {
+            if bands.is_none() {
                 motion = motion.max(assessed.motion);
                 orders.extend(assessed.order);
             }
@@ -218,8 +221,11 @@ pub fn expected(
     let [low, high] = interval.map(bound);
     let error = squares.mapv(|square| (square.sqrt() * unit) as f32);
     let psnr_db = psnr_db.min(Assessment::MAX_PSNR_DB);
-    let unresolved =
-        if spectral { "fine texture or spectral detail" } else { "fine texture or fast motion" };
+    let unresolved = if bands.is_some() {
+        "fine texture or spectral detail"
+    } else {
+        "fine texture or fast motion"
+    };
     let mut reasons = reasons(&error, &unmeasured, psnr_db, peak, unresolved, warnings);
     reasons.extend(unexplained_pixels(&predictions));
     reasons.extend(exchanged_masks(&orders));
@@ -480,7 +486,7 @@ mod tests {
         let shares = SequencePlan::separate(0..1).shares(0, &[], 2);
         let assess_at = |peak, tiles: Vec<Option<TileAssessment>>| {
             let shares = [(shares[0].clone(), tiles)];
-            expected(&plan, &shares, (&Schedule::gap_tv(), false), (2, 0.5, peak), &[])
+            expected(&plan, &shares, (&Schedule::gap_tv(), None), (2, 0.5, peak), &[])
         };
         let assess = |tiles| assess_at(1.0, tiles);
         let tiles =

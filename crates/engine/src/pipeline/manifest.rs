@@ -133,7 +133,7 @@ impl Recipe {
             return None;
         }
         let scale = (self.shape.frames, self.scale.normalisation, self.scale.white_level);
-        let input = (&self.schedule, self.dispersion.is_some());
+        let input = (&self.schedule, self.dispersion.as_ref());
         let warnings = self.warnings_of(snapshot);
         let mut expected = expected(&self.tile_plan, shares, input, scale, &warnings)?;
         if let Some(dispersion) = &self.dispersion {
