@@ -122,8 +122,8 @@ impl Store {
         let forecast = self.forecast().await?;
         let left = |of_tiles: bool| {
             let is_tile = |kind| matches!(kind, TaskKind::Tile { .. } | TaskKind::Pilot);
-            let of_kind = |kind: TaskKind| is_tile(kind) == of_tiles;
-            let costs = tasks.iter().filter(|(kind, _)| of_kind(*kind)).map(|(_, cost)| *cost);
+            let is_wanted = |kind: TaskKind| is_tile(kind) == of_tiles;
+            let costs = tasks.iter().filter(|(kind, _)| is_wanted(*kind)).map(|(_, cost)| *cost);
             costs.fold(Left { sum: 0.0, longest: 0.0 }, |left, cost| Left {
                 sum: left.sum + cost,
                 longest: left.longest.max(cost),

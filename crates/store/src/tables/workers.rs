@@ -152,7 +152,7 @@ impl Store {
                                          total(kind IN ('tile', 'pilot')) AS tiles FROM tasks
                                      WHERE state = 'running' AND light = 0 AND lease_until IS NOT NULL)
                     SELECT CAST(min(workers, tasks - running.tiles + min(for_tiles, running.tiles
-                        + (SELECT count(*) FROM (SELECT 1 FROM tasks
+                        + (SELECT count(*) FROM (SELECT 1 FROM tasks INDEXED BY tasks_tiles
                                                  WHERE state = 'ready' AND kind IN ('tile', 'pilot')
                                                  LIMIT (SELECT workers FROM live))))) AS INTEGER)
                     FROM live, running";
