@@ -25,6 +25,9 @@ pub const VERSION: &str = match option_env!("SCI_RECON_VERSION") {
 /// Exit code of a worker that lost its GPU: EX_TEMPFAIL of sysexits.h.
 pub(crate) const DEVICE_LOST: u8 = 75;
 
+/// Largest number of CPU workers beside those on a GPU. More would wait for the disk.
+const MAX_HOST_WORKERS: usize = 4;
+
 /// Run the HTTP service, its dashboard and its workers.
 #[derive(Debug, Clone, Args)]
 pub struct ServeArguments {
@@ -73,9 +76,10 @@ pub struct ServeArguments {
     )]
     pub webhook_hosts: Vec<String>,
 
-    /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. 0 runs none,
-    /// for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other machines [default:
-    /// one per core, one on a GPU].
+    /// Worker processes to run in addition to the light worker, which performs checks and other short tasks. With a GPU, the
+    /// number of those that use it; workers on the CPU, one for each other core but at most four, take all tasks except
+    /// tiles. 0 runs none, for workers that are started by hand. With --nats, 0 runs one that leaves the tiles to other
+    /// machines [default: one per core, one on a GPU].
     #[arg(long, env = "SCI_RECON_WORKERS", value_name = "N")]
     pub workers: Option<usize>,
 
@@ -353,6 +357,10 @@ pub enum Takes {
     All,
     /// All except tiles, which are left to other machines.
     WithoutTiles,
+    /// Tiles and pilots, on a GPU.
+    Gpu,
+    /// All except tiles and pilots, on the CPU beside workers on a GPU.
+    Host,
     /// Short tasks, which must not wait for tiles, and at the same time checks of users' networks, one after the other.
     Light,
 }
@@ -363,6 +371,8 @@ impl Takes {
         match self {
             Self::All => &[Claimant::Local],
             Self::WithoutTiles => &[Claimant::WithoutTiles],
+            Self::Gpu => &[Claimant::Gpu],
+            Self::Host => &[Claimant::Host],
             Self::Light => &[Claimant::Light, Claimant::Networks],
         }
     }
@@ -375,7 +385,7 @@ pub struct EngineArguments {
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub onnxruntime: Option<PathBuf>,
 
-    /// Device that runs networks, and total variation in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
+    /// Device that runs networks, and the solver in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
     /// cuda:N (NVIDIA, from 0; networks only).
     #[arg(long, env = "SCI_RECON_DEVICE", value_name = "DEVICE", default_value = "cpu",
           value_parser = device)]
@@ -480,6 +490,10 @@ pub enum LogFormat {
     Json,
 }
 
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
 impl ServeArguments {
     /// True if other machines can reach the service and need no token; `open` means that there are no tokens.
     #[must_use]
@@ -487,16 +501,26 @@ impl ServeArguments {
         open && !self.listen.ip().is_loopback() && !self.allow_remote
     }
 
+    /// Number of workers on the device.
     #[must_use]
     pub fn worker_count(&self) -> usize {
-        let cores = || match self.engine.device.as_str() {
-            "cpu" => std::thread::available_parallelism().map_or(1, usize::from),
+        let default = || match self.engine.device.as_str() {
+            "cpu" => cores(),
             // Workers that share a GPU share its memory, too.
             _ => 1,
         };
         // Tasks that do not leave this machine need a worker.
         let minimum = usize::from(self.without_tiles());
-        self.workers.unwrap_or_else(cores).max(minimum)
+        self.workers.unwrap_or_else(default).max(minimum)
+    }
+
+    /// Number of workers on the CPU beside those on a GPU, for all tasks except tiles and pilots.
+    #[must_use]
+    pub fn host_worker_count(&self) -> usize {
+        if self.engine.device == "cpu" || self.workers == Some(0) {
+            return 0;
+        }
+        cores().saturating_sub(self.worker_count()).clamp(1, MAX_HOST_WORKERS)
     }
 
     /// True if the workers of this machine leave the tiles to others.
@@ -641,13 +665,17 @@ mod tests {
 
     #[test]
     fn one_worker_uses_a_gpu_unless_others_are_wanted() {
-        let count = |more: &[&str]| {
+        let counts = |more: &[&str]| {
             let line = [&["serve", "--data", "d"], more].concat();
-            Serve::try_parse_from(line).unwrap().arguments.worker_count()
+            let arguments = Serve::try_parse_from(line).unwrap().arguments;
+            (arguments.worker_count(), arguments.host_worker_count())
         };
-        assert_eq!(count(&["--device", "gpu"]), 1);
-        assert_eq!(count(&["--device", "cuda:0", "--workers", "3"]), 3);
-        assert_eq!(count(&[]), std::thread::available_parallelism().unwrap().get());
+        let cores = std::thread::available_parallelism().unwrap().get();
+        let beside = |workers| cores.saturating_sub(workers).clamp(1, 4);
+        assert_eq!(counts(&["--device", "gpu"]), (1, beside(1)));
+        assert_eq!(counts(&["--device", "cuda:0", "--workers", "3"]), (3, beside(3)));
+        assert_eq!(counts(&["--device", "gpu", "--workers", "0"]), (0, 0));
+        assert_eq!(counts(&[]), (cores, 0));
     }
 
     #[test]

@@ -211,7 +211,7 @@ pub struct NetworkArguments {
     /// Path of libonnxruntime [default: next to the program, or in ../lib/sci-recon, ../lib or ../../runtime].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     onnxruntime: Option<PathBuf>,
-    /// Device that runs networks, and total variation in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
+    /// Device that runs networks, and the solver in a build with the feature gpu: cpu, gpu (the first GPU of any vendor), or
     /// cuda:N (NVIDIA, from 0; networks only).
     #[arg(long, value_name = "DEVICE", default_value = "cpu", value_parser = device)]
     device: String,

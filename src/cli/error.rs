@@ -90,6 +90,7 @@ impl From<ReconError> for CliError {
         match error {
             ReconError::Runtime(_)
             | ReconError::DeviceLost(_)
+            | ReconError::DeviceFull(_)
             | ReconError::Diverged { .. }
             | ReconError::Cancelled => Self::Failure(text),
             _ => Self::Input(text),

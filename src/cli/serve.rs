@@ -137,12 +137,13 @@ async fn serve(settings: &ServeArguments) -> Result<(), ServeError> {
     let hub = cluster(settings, &networks, &store).await?;
     let trouble = hub.as_ref().map(Hub::trouble);
     let mut lines = vec![workers.clone(); settings.worker_count()];
+    let on_cpu = EngineArguments { device: "cpu".into(), ..workers.engine.clone() };
+    let host = WorkerArguments { takes: Takes::Host, engine: on_cpu.clone(), ..workers.clone() };
+    lines.extend(vec![host; settings.host_worker_count()]);
     // Clients wait for the checks of their uploads, so these must not wait for tiles. Short tasks need no GPU, and checks of
     // users' networks run where these networks will.
-    let mut engine = EngineArguments { nice: 0, ..workers.engine.clone() };
-    if !engine.unconfined {
-        "cpu".clone_into(&mut engine.device);
-    }
+    let engine = if on_cpu.unconfined { workers.engine.clone() } else { on_cpu };
+    let engine = EngineArguments { nice: 0, ..engine };
     lines.push(WorkerArguments { takes: Takes::Light, engine, ..workers });
     let (device, device_state) = watch::channel(DeviceState::Untried);
     let supervisor = Supervisor::start(&store, &program, lines, &device, &stop);
@@ -212,7 +213,11 @@ fn worker_arguments(settings: &ServeArguments, root: &Path) -> WorkerArguments {
     WorkerArguments {
         data: Some(root.to_owned()),
         remote: RemoteArguments::default(),
-        takes: if settings.without_tiles() { Takes::WithoutTiles } else { Takes::All },
+        takes: match settings.host_worker_count() {
+            _ if settings.without_tiles() => Takes::WithoutTiles,
+            0 => Takes::All,
+            _ => Takes::Gpu,
+        },
         memory_bytes: Some(allowance(settings.worker_memory_bytes)),
         engine: settings.engine.clone(),
         log_format: settings.log_format,

@@ -44,7 +44,7 @@ pub(super) struct Supervisor {
 
 impl Supervisor {
     /// Starts one worker for each element of `workers`. They end when `stop` becomes true. `device` receives the state
-    /// of the device of workers that take more than short tasks.
+    /// of the device of workers that are not on the CPU by design.
     pub(super) fn start(
         store: &Store,
         program: &Path,
@@ -57,7 +57,8 @@ impl Supervisor {
             let slot = Slot {
                 store: store.clone(),
                 program: program.to_owned(),
-                device: (arguments.takes != Takes::Light).then(|| device.clone()),
+                device: (!matches!(arguments.takes, Takes::Host | Takes::Light))
+                    .then(|| device.clone()),
                 arguments,
                 stop: stop.clone(),
             };

@@ -86,7 +86,7 @@ pub(super) async fn show(State(app): State<App>) -> Result<Json<SystemBody>> {
         device: settings.engine.device.clone(),
         provider: settings.engine.provider(),
         onnxruntime: app.store.last_onnxruntime().await?,
-        workers_wanted: settings.worker_count(),
+        workers_wanted: settings.worker_count() + settings.host_worker_count(),
         workers: app.store.live_workers(WORKER_AGE).await?,
         degraded: app.troubles().await?,
         jobs: jobs(&app).await?,

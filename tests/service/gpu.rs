@@ -18,6 +18,8 @@ use crate::samples::Scene;
 const ICD: &str = "/usr/lib/chromium/vk_swiftshader_icd.json";
 /// Largest difference between CPU and GPU on frames of [0, 1].
 const TOLERANCE: f32 = 1e-4;
+/// Time for a driver that compiles its kernels on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(300);
 /// Few passes of the default's priors, with the 32-bit network and without a pilot.
 const SCHEDULE: &str = r#"{"adaptive": false, "stages": [
     {"prior": "tv", "iterations": 4, "tv_weight": 0.15, "tolerance": 0},
@@ -54,7 +56,7 @@ async fn a_missing_device_stops_its_workers_at_the_start() {
             if ready["device"].as_str().is_some_and(|state| state.contains("refused")) {
                 break ready;
             }
-            assert!(start.elapsed() < Duration::from_secs(60), "{ready}");
+            assert!(start.elapsed() < PATIENCE, "{ready}");
             tokio::time::sleep(Duration::from_millis(100)).await;
         };
         assert_eq!(ready["degraded"], json!(true), "{ready}");
@@ -66,7 +68,8 @@ async fn a_missing_device_stops_its_workers_at_the_start() {
         let detail = app.post("/v1/jobs", &body).await.problem(422, "invalid_request");
         assert!(detail.contains(device), "{detail}");
         let system = app.get("/v1/system").await.expect(200).json();
-        assert_eq!(system["workers"], json!([]));
+        let workers = system["workers"].as_array().unwrap();
+        assert!(workers.iter().all(|worker| worker["device"] == "cpu"), "{system}");
         assert!(system["degraded"].to_string().contains(device), "{system}");
     }
 }
@@ -188,18 +191,20 @@ impl FaultyDriver {
             ("VK_ICD_FILENAMES", self.file("icd.json")),
             ("FAULTY_GPU_DRIVER", self.original.to_str().unwrap().to_owned()),
             ("FAULTY_GPU_LOSS", self.file("loss")),
+            ("FAULTY_GPU_FULL", self.file("full")),
+            ("FAULTY_GPU_MEMORY", self.file("memory")),
         ];
         let environment: Vec<_> =
             environment.iter().map(|(name, value)| (*name, &**value)).collect();
         TestApp::in_environment(arguments, &environment).await
     }
 
-    /// Loses the device at its next work.
-    async fn lose(&self) {
-        std::fs::write(self.file("loss"), "").unwrap();
+    /// Requests a fault, and waits until it has occurred: `loss` at the next work, or `full` at the next allocation.
+    async fn fail(&self, fault: &str) {
+        std::fs::write(self.file(fault), "").unwrap();
         let start = Instant::now();
-        while Path::new(&self.file("loss")).exists() {
-            assert!(start.elapsed() < Duration::from_secs(60), "no work reaches the driver");
+        while Path::new(&self.file(fault)).exists() {
+            assert!(start.elapsed() < PATIENCE, "no work reaches the driver");
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     }
@@ -215,9 +220,7 @@ async fn a_worker_is_replaced_after_the_loss_of_its_device() {
     let app = driver.service(&options).await;
     let scene = Scene { frames: 4, height: 48, width: 48, ..Scene::SMALL };
     let (_, measurement) = app.scene(&scene).await;
-    let stage = json!({"prior": "tv", "iterations": 1500, "tv_weight": 0.1, "tolerance": 0});
-    let schedule = json!({"adaptive": false, "stages": [stage]});
-    let body = json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 0, "schedule": schedule});
+    let body = variation(&measurement, 1500, 64);
     let job = app.submit(&body).await;
     let start = Instant::now();
     loop {
@@ -226,20 +229,103 @@ async fn a_worker_is_replaced_after_the_loss_of_its_device() {
         if tiles["items"][0]["iterations"].as_u64() > Some(0) {
             break;
         }
-        assert!(start.elapsed() < Duration::from_secs(60), "{tiles}");
+        assert!(start.elapsed() < PATIENCE, "{tiles}");
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    driver.lose().await;
+    driver.fail("loss").await;
     let done = app.ended(&job).await;
     assert_eq!(done["state"], "succeeded", "{done:#}");
     let figures = String::from_utf8(app.get("/metrics").await.expect(200).bytes).unwrap();
     let exits = "sci_recon_worker_exits_total{reason=\"device_lost\"} 1";
     assert!(figures.lines().any(|line| line == exits), "{figures}");
+    let lost = texts(&app, "SELECT reason FROM attempts WHERE outcome = 'lost'").await;
+    assert_eq!(lost, ["the GPU of the worker was lost"]);
+}
+
+/// A request for a job of total variation, in tiles with sides of up to `tile` pixels.
+#[cfg(feature = "gpu")]
+fn variation(measurement: &str, iterations: u32, tile: u32) -> Value {
+    let stage = json!({"prior": "tv", "iterations": iterations, "tv_weight": 0.1, "tolerance": 0});
+    json!({"measurement": measurement, "algorithm": "gap-tv", "snapshots": 0,
+        "tile": {"size": tile, "overlap": 8}, "schedule": {"adaptive": false, "stages": [stage]}})
+}
+
+/// The texts that a query of the service's database finds.
+#[cfg(feature = "gpu")]
+async fn texts(app: &TestApp, query: &'static str) -> Vec<String> {
     let options = SqliteConnectOptions::new().filename(app.data().join("sci-recon.db"));
     let mut database = options.connect().await.unwrap();
-    let lost = "SELECT reason FROM attempts WHERE outcome = 'lost'";
-    let reasons: Vec<String> = sqlx::query_scalar(lost).fetch_all(&mut database).await.unwrap();
-    assert_eq!(reasons, ["the GPU of the worker was lost"]);
+    sqlx::query_scalar(query).fetch_all(&mut database).await.unwrap()
+}
+
+/// Waits until all workers live, and returns their devices.
+#[cfg(feature = "gpu")]
+async fn devices(app: &TestApp) -> Vec<String> {
+    let start = Instant::now();
+    loop {
+        let system = app.get("/v1/system").await.expect(200).json();
+        let workers = system["workers"].as_array().unwrap();
+        if system["workers_wanted"] == json!(workers.len()) {
+            let device = |worker: &Value| worker["device"].as_str().unwrap().to_owned();
+            return workers.iter().map(device).collect();
+        }
+        assert!(start.elapsed() < PATIENCE, "{system:#}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Workers on the GPU take the pilot and the tiles, and workers on the CPU the other tasks. The rates of both are learned
+/// apart.
+#[cfg(feature = "gpu")]
+#[tokio::test]
+async fn workers_on_the_cpu_take_the_other_tasks() {
+    let Some(library) = webgpu() else { return };
+    let options = ["--workers", "2", "--device", "gpu", "--onnxruntime", &library];
+    let app = TestApp::in_environment(&options, &[("VK_ICD_FILENAMES", ICD)]).await;
+    let found = devices(&app).await;
+    let on_gpu = found.iter().filter(|device| *device == "gpu").count();
+    assert!(on_gpu == 2 && (3..=6).contains(&found.len()), "{found:?}");
+    let scene = Scene { frames: 4, height: 64, width: 176, ..Scene::SMALL };
+    let (_, measurement) = app.scene(&scene).await;
+    let body = json!({"measurement": measurement, "algorithm": "gap-tv3d", "snapshots": 0,
+        "tile": {"size": 64, "overlap": 8}});
+    let job = app.submit(&body).await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    let on_gpu = "SELECT kind FROM rates WHERE device = 'gpu' ORDER BY kind";
+    assert_eq!(texts(&app, on_gpu).await, ["pilot", "tile"]);
+    let on_cpu = texts(&app, "SELECT kind FROM rates WHERE device = 'cpu'").await;
+    for kind in ["prepare", "preview", "white", "assemble", "manifest"] {
+        assert!(on_cpu.iter().any(|found| found == kind), "{kind} is not in {on_cpu:?}");
+    }
+    assert!(!on_cpu.iter().any(|kind| kind == "tile" || kind == "pilot"), "{on_cpu:?}");
+}
+
+/// A tile runs again if the GPU was full for a moment. If it stays full, the job fails with the remedy.
+#[cfg(feature = "gpu")]
+#[tokio::test]
+async fn a_tile_on_a_full_gpu_runs_again_without_networks() {
+    let Some(library) = webgpu() else { return };
+    let driver = FaultyDriver::build();
+    let options = ["--workers", "1", "--device", "gpu", "--onnxruntime", &library];
+    let app = driver.service(&options).await;
+    devices(&app).await;
+    // The arrays of a tile exceed the memory that the driver keeps.
+    let scene = Scene { frames: 8, height: 256, width: 256, ..Scene::SMALL };
+    let (_, measurement) = app.scene(&scene).await;
+    let job = app.submit(&variation(&measurement, 3, 256)).await;
+    driver.fail("full").await;
+    let done = app.ended(&job).await;
+    assert_eq!(done["state"], "succeeded", "{done:#}");
+    let failures = "SELECT coalesce(reason, outcome) FROM attempts WHERE outcome <> 'done'";
+    assert_eq!(texts(&app, failures).await, [""; 0]);
+
+    std::fs::write(driver.file("memory"), "1024").unwrap();
+    let job = app.submit(&variation(&measurement, 4, 256)).await;
+    let failed = app.ended(&job).await;
+    assert_eq!(failed["state"], "failed", "{failed:#}");
+    let text = failed["error"].to_string();
+    assert!(text.contains("too little free memory") && text.contains("smaller tiles"), "{text}");
 }
 
 /// All steps of the script for machines with a card, with few iterations.

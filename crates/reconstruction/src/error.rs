@@ -45,6 +45,9 @@ pub enum ReconError {
     /// The driver of the device stopped or was reset. Only a new process can use the device again.
     #[error("{0}")]
     DeviceLost(String),
+    /// The memory of the device is full. Other work may free some.
+    #[error("{0}")]
+    DeviceFull(String),
     /// The frames are no longer finite.
     #[error("the reconstruction diverged at iteration {iteration} of {planned}")]
     Diverged {

@@ -437,6 +437,20 @@ async fn workers_are_busy_as_far_as_there_are_tasks_for_them() {
     assert_eq!(last, Some(1), "the last tile is computed alone");
     assert!(beside_tile.len() > 1 && beside_tile.iter().all(|busy| *busy == 2), "{beside_tile:?}");
     assert_eq!(busy().await, 0);
+    sqlx::query("UPDATE workers SET tiles = id = ?")
+        .bind(lab.worker.to_string())
+        .execute(&lab.store.writer)
+        .await
+        .unwrap();
+    lab.submit(0).await;
+    let mut beside_tile = Vec::new();
+    while let Some(task) = lab.claim().await {
+        if matches!(task.kind, TaskKind::Tile { .. }) {
+            beside_tile.push(busy().await);
+        }
+        lab.work(&task).await;
+    }
+    assert_eq!(beside_tile, [1; 4], "one worker takes tiles");
 }
 
 #[tokio::test]

@@ -30,6 +30,7 @@ use engine::pipeline::write::{OnDisk, write_manifest, write_result};
 use engine::pipeline::{movie, preview, registration, scale};
 use formats::planar::{self, Reader};
 use formats::{Limits, StackInfo};
+use reconstruction::ReconError;
 use reconstruction::sequence::RunShare;
 use store::{CalibrationDone, NewCalibration, StagedBlob};
 
@@ -74,15 +75,17 @@ pub(super) fn perform(
             let first = snapshots.first as usize;
             let task = Pilot { first, crop: &crop, schedule: &schedule, runs: &runs };
             engines.models.only(None, monitor)?;
-            let networks = &mut engines.networks;
-            let record = run_pilot(&arrays, white, (snapshots, &task), networks, monitor)?;
+            let record = with_room(engines, |Engines { networks, .. }| {
+                run_pilot(&arrays, white, (snapshots, &task), networks, monitor)
+            })?;
             let reduced = full_schedule(&schedule, record.as_ref());
             let share = reduced.planned_ns_per_voxel() / schedule.planned_ns_per_voxel();
             monitor.reach(monitor.progress().stage, 1.0);
             (json(&record)?, Output::TileCost(share))
         }
         TaskInput::Tile(task) => {
-            let (record, frames) = tile(transport, &task, engines, monitor)?;
+            let (record, frames) =
+                with_room(engines, |engines| tile(transport, &task, engines, monitor))?;
             (json(&record)?, Output::Stack(frames))
         }
         TaskInput::White { recipe, snapshots, tiles } => {
@@ -199,6 +202,24 @@ fn facts(calibrated: &Calibrated, masks: Sha256) -> NewCalibration {
 /// Converts a task's record into JSON.
 fn json(record: &impl Serialize) -> Result<Value, PipelineError> {
     serde_json::to_value(record).map_err(PipelineError::record("task"))
+}
+
+/// Runs a computation, and repeats it without cached networks if the memory of the GPU was full.
+fn with_room<T>(
+    engines: &mut Engines,
+    mut compute: impl FnMut(&mut Engines) -> Result<T, PipelineError>,
+) -> Result<T, PipelineError> {
+    match compute(engines) {
+        Err(PipelineError::Recon(ReconError::DeviceFull(reason))) => {
+            tracing::warn!(
+                reason,
+                "the memory of the GPU is full; the task runs again without cached networks"
+            );
+            engines.networks.clear();
+            compute(engines)
+        }
+        outcome => outcome,
+    }
 }
 
 fn run_pilot(

@@ -2,6 +2,7 @@
 //
 // FAULTY_GPU_LOSS   names a file. If it exists at a submission of work, it is deleted, and the device is lost from then on,
 //                   as after a reset of a card.
+// FAULTY_GPU_FULL   names a file. If it exists at an allocation, it is deleted, and the allocation fails for lack of memory.
 // FAULTY_GPU_MEMORY names a file with a number. Larger allocations in bytes fail for lack of memory.
 
 #define _GNU_SOURCE
@@ -50,6 +51,9 @@ static int32_t faulty_submit(void *queue, uint32_t count, const void *submits, v
 
 static int32_t faulty_allocate(void *device, const struct allocation *info, const void *callbacks, void *memory)
 {
+    const char *full = getenv("FAULTY_GPU_FULL");
+    if (full && unlink(full) == 0)
+        return OUT_OF_DEVICE_MEMORY;
     unsigned long long most;
     const char *name = getenv("FAULTY_GPU_MEMORY");
     FILE *file = name ? fopen(name, "r") : NULL;

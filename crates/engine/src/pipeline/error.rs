@@ -72,7 +72,8 @@ impl PipelineError {
     pub fn is_retryable(&self) -> bool {
         match self {
             Self::Recon(error) => {
-                matches!(error, ReconError::Runtime(_) | ReconError::DeviceLost(_))
+                use ReconError::{DeviceFull, DeviceLost, Runtime};
+                matches!(error, Runtime(_) | DeviceLost(_) | DeviceFull(_))
             }
             Self::Format(error) => !error.is_callers_fault(),
             Self::Snapshot { .. }

@@ -170,6 +170,15 @@ pub enum NetworkError {
     Runtime(#[from] ReconError),
 }
 
+impl NetworkError {
+    fn into_recon(self) -> ReconError {
+        match self {
+            Self::Runtime(error) => error,
+            other => ReconError::Runtime(other.to_string()),
+        }
+    }
+}
+
 /// Loads networks. The library is opened on first use, because total variation does not need it.
 #[derive(Debug, Clone)]
 pub struct NetworkSource {
@@ -485,6 +494,11 @@ impl WarmNetworks {
         Ok(&mut self.end_to_end.insert((file.sha256(), network)).1)
     }
 
+    /// Frees the networks, which are loaded again on their next use.
+    pub fn clear(&mut self) {
+        (self.loaded, self.encoder, self.end_to_end) = (Vec::new(), None, None);
+    }
+
     /// The source of the networks.
     pub fn source(&self) -> &NetworkSource {
         &self.source
@@ -501,7 +515,7 @@ impl Networks for WarmNetworks {
             Some(index) => index,
             None => {
                 let denoiser = self.source.load(network, &self.cores);
-                let denoiser = denoiser.map_err(|error| ReconError::Runtime(error.to_string()))?;
+                let denoiser = denoiser.map_err(NetworkError::into_recon)?;
                 self.loaded.push((network, denoiser));
                 self.loaded.len() - 1
             }
@@ -512,10 +526,7 @@ impl Networks for WarmNetworks {
     fn encoder(&mut self) -> Result<Option<&mut dyn Encoder>, ReconError> {
         let encoder = match self.encoder.take() {
             Some(encoder) => encoder,
-            None => {
-                let loaded = self.source.encoder(&self.cores);
-                loaded.map_err(|error| ReconError::Runtime(error.to_string()))?
-            }
+            None => self.source.encoder(&self.cores).map_err(NetworkError::into_recon)?,
         };
         Ok(Some(self.encoder.insert(encoder)))
     }

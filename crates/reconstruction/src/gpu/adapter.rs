@@ -7,8 +7,8 @@ use pollster::block_on;
 use wgpu::{
     Backends, Buffer, BufferDescriptor, BufferUsages, CommandEncoder, ComputePipeline,
     ComputePipelineDescriptor, Device, DeviceDescriptor, DeviceLostReason, ErrorFilter, Instance,
-    InstanceDescriptor, InstanceFlags, Limits, MapMode, PollType, PowerPreference, Queue,
-    RequestAdapterOptions, ShaderModule, include_wgsl,
+    InstanceDescriptor, InstanceFlags, Limits, MapMode, MemoryHints, PollType, PowerPreference,
+    Queue, RequestAdapterOptions, ShaderModule, include_wgsl,
 };
 
 use crate::error::{ReconError, Result};
@@ -43,6 +43,7 @@ pub(crate) struct Kernels {
 /// A failure that the driver reports outside of calls.
 enum Fault {
     Lost(String),
+    Full(String),
     Other(String),
 }
 
@@ -87,7 +88,10 @@ impl Gpu {
             max_storage_buffer_binding_size: has.max_storage_buffer_binding_size,
             ..Limits::default()
         };
-        let mut descriptor = DeviceDescriptor { required_limits, ..Default::default() };
+        // Workers and networks share the memory.
+        let memory_hints = MemoryHints::MemoryUsage;
+        let mut descriptor =
+            DeviceDescriptor { required_limits, memory_hints, ..Default::default() };
         change(&mut descriptor);
         let opened = block_on(adapter.request_device(&descriptor));
         let (device, queue) = opened.map_err(|error| {
@@ -105,7 +109,10 @@ impl Gpu {
         let shared = Arc::clone(&fault);
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
             let mut fault = shared.lock().unwrap_or_else(PoisonError::into_inner);
-            fault.get_or_insert_with(|| Fault::Other(error.to_string()));
+            fault.get_or_insert_with(|| match error {
+                wgpu::Error::OutOfMemory { .. } => Fault::Full(error.to_string()),
+                _ => Fault::Other(error.to_string()),
+            });
         }));
         let module = device.create_shader_module(include_wgsl!("kernels.wgsl"));
         let nonlocal = device.create_shader_module(include_wgsl!("nonlocal.wgsl"));
@@ -155,7 +162,8 @@ impl Gpu {
     /// Fails if the driver has reported a fault.
     ///
     /// # Errors
-    /// [`ReconError::DeviceLost`] from the loss of the device on, [`ReconError::Runtime`] once after another fault.
+    /// [`ReconError::DeviceLost`] from the loss of the device on, [`ReconError::DeviceFull`] or [`ReconError::Runtime`]
+    /// once after another fault.
     pub(crate) fn check(&self) -> Result<()> {
         let fault = || self.fault.lock().unwrap_or_else(PoisonError::into_inner);
         if fault().is_none() {
@@ -167,6 +175,11 @@ impl Gpu {
         match &*fault {
             Some(Fault::Lost(text)) => {
                 Err(ReconError::DeviceLost(format!("the GPU {} was lost ({text})", self.name)))
+            }
+            Some(Fault::Full(reason)) => {
+                let error = self.full("a tile", reason);
+                *fault = None;
+                Err(error)
             }
             Some(Fault::Other(text)) => {
                 let text = polled.map_or_else(|error| format!("{text}; {error}"), |_| text.clone());
@@ -201,24 +214,31 @@ impl Gpu {
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
         let buffers = lengths.map(|length| self.buffer(bytes(length), usage));
         let total: u64 = lengths.into_iter().map(bytes).sum();
-        let failure = block_on(scope.pop());
-        failure
-            .map_or(Ok(buffers), |error| Err(Shortage::Memory { total, reason: error.to_string() }))
+        block_on(scope.pop()).map_or(Ok(buffers), |error| {
+            // Memory of finished work becomes free for the next attempt. A loss is reported by `check`.
+            let _ = self.device.poll(PollType::wait_indefinitely());
+            Err(Shortage::Memory { total, reason: error.to_string() })
+        })
     }
 
     /// The error of a task for which the device is too small.
     pub(crate) fn refusal(&self, shortage: &Shortage) -> ReconError {
         let name = &self.name;
-        ReconError::Runtime(match shortage {
-            Shortage::Limit { largest, limit } => format!(
+        match shortage {
+            Shortage::Limit { largest, limit } => ReconError::Runtime(format!(
                 "the GPU {name} accepts arrays of up to {limit} bytes, but a tile needs {largest}: choose smaller tiles, \
                  or use --device cpu"
-            ),
-            Shortage::Memory { total, reason } => format!(
-                "the GPU {name} has too little free memory for {total} bytes: choose smaller tiles, run fewer workers \
-                 on this GPU, or use --device cpu ({reason})"
-            ),
-        })
+            )),
+            Shortage::Memory { total, reason } => self.full(&format!("{total} bytes"), reason),
+        }
+    }
+
+    fn full(&self, needed: &str, reason: &str) -> ReconError {
+        let name = &self.name;
+        ReconError::DeviceFull(format!(
+            "the GPU {name} has too little free memory for {needed}: choose smaller tiles, run fewer workers on this \
+             GPU, or use --device cpu ({reason})"
+        ))
     }
 
     pub(crate) fn buffer(&self, size: u64, usage: BufferUsages) -> Buffer {

@@ -10,7 +10,7 @@ use ndarray::{Array3, s};
 use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 use serde_json::json;
-use wgpu::MemoryHints;
+use wgpu::{BufferUsages, MemoryHints};
 
 use super::adapter::Gpu;
 use super::nonlocal::Clip;
@@ -516,8 +516,14 @@ fn on_a_faulty_device() {
     let y = Array3::zeros((1, 640, 640));
     let mut on = On(gpu);
     let ended = reconstruct(&operator, y.view(), &Schedule::gap_tv(), &mut on, &mut ());
-    let error = ended.map(|_| ()).unwrap_err().to_string();
+    let error = ended.map(|_| ()).unwrap_err();
+    assert!(matches!(error, ReconError::DeviceFull(_)), "{error:?}");
+    let error = error.to_string();
     assert!(error.contains("too little free memory") && error.contains("smaller tiles"), "{error}");
+    // A buffer that is allocated without an error scope.
+    let _ = on.0.buffer(8 << 20, BufferUsages::STORAGE);
+    let checked = on.0.check();
+    assert!(matches!(checked, Err(ReconError::DeviceFull(_))), "{checked:?}");
     std::fs::remove_file(&memory).unwrap();
     solve(&Schedule::gap_tv().with_iterations(2), &mut on).unwrap();
     std::fs::write(std::env::var("FAULTY_GPU_LOSS").unwrap(), "").unwrap();

@@ -73,7 +73,7 @@ impl Device {
         if self == Self::Cpu {
             ReconError::Runtime(format!("network {name}: {error}"))
         } else if mentions(&["out of memory", "out of device memory", "failed to allocate"]) {
-            ReconError::Runtime(format!(
+            ReconError::DeviceFull(format!(
                 "the GPU has too little free memory for the network {name}: choose smaller tiles, run fewer workers \
                  on this GPU, or use --device cpu ({error})"
             ))
@@ -158,11 +158,12 @@ impl Runtime {
     }
 
     fn session(&self, name: &str, model: &[u8], threads: usize) -> Result<Session> {
-        let failed = |error: String| {
-            ReconError::Runtime(format!(
+        let failed = |error: String| match self.device.failure(name, &error) {
+            ReconError::Runtime(_) => ReconError::Runtime(format!(
                 "the network {name} can't be loaded on {}: {error}",
                 self.device.provider()
-            ))
+            )),
+            other => other,
         };
         let build = || -> Result<Session, String> {
             let text = |error: ort::Error<ort::session::builder::SessionBuilder>| error.to_string();
@@ -372,8 +373,9 @@ mod tests {
         for text in
             ["VK_ERROR_OUT_OF_DEVICE_MEMORY", "CUDA out of memory", "Failed to allocate buffer"]
         {
-            let error = Device::Gpu.failure("n", text).to_string();
-            assert!(error.contains("smaller tiles"), "{error}");
+            let error = Device::Gpu.failure("n", text);
+            assert!(matches!(error, ReconError::DeviceFull(_)), "{error:?}");
+            assert!(error.to_string().contains("smaller tiles"), "{error}");
         }
     }
 }

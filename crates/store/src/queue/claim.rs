@@ -196,6 +196,11 @@ impl Claimant<'_> {
             Self::WithoutTiles => {
                 look_text!(concat!("AND kind <> 'tile' AND NOT ", network_check!()), "tasks_others")
             }
+            Self::Gpu => look_text!("AND kind IN ('tile', 'pilot')", "tasks_tiles"),
+            Self::Host => look_text!(
+                concat!("AND kind <> 'tile' AND kind <> 'pilot' AND NOT ", network_check!()),
+                "tasks_others"
+            ),
             Self::Light => look_text!(
                 concat!("AND light = 1 AND NOT ", network_check!()),
                 "tasks_light",
@@ -205,7 +210,10 @@ impl Claimant<'_> {
                 concat!("AND light = 1 AND job IS NULL AND ", network_check!()),
                 "tasks_light"
             ),
-            Self::Pool(_) => look_text!("AND kind = 'tile'", "tasks_tiles"),
+            // SQLite uses an index with a condition only if the statement repeats it.
+            Self::Pool(_) => {
+                look_text!("AND kind IN ('tile', 'pilot') AND kind = 'tile'", "tasks_tiles")
+            }
         }
     }
 
@@ -223,6 +231,15 @@ impl Claimant<'_> {
                 "tasks_others",
                 "tasks_others_of_job"
             ),
+            Self::Gpu => {
+                take_text!("AND kind IN ('tile', 'pilot')", "", "tasks_tiles", "tasks_tiles_of_job")
+            }
+            Self::Host => take_text!(
+                concat!("AND kind <> 'tile' AND kind <> 'pilot' AND NOT ", network_check!()),
+                "",
+                "tasks_others",
+                "tasks_others_of_job"
+            ),
             // It begins no job.
             Self::Light => take_text!(
                 concat!("AND light = 1 AND NOT ", network_check!()),
@@ -236,9 +253,12 @@ impl Claimant<'_> {
                 "tasks_light",
                 "tasks_light_of_job"
             ),
-            Self::Pool(_) => {
-                take_text!("AND kind = 'tile'", "", "tasks_tiles", "tasks_tiles_of_job")
-            }
+            Self::Pool(_) => take_text!(
+                "AND kind IN ('tile', 'pilot') AND kind = 'tile'",
+                "",
+                "tasks_tiles",
+                "tasks_tiles_of_job"
+            ),
         }
     }
 }
@@ -495,10 +515,15 @@ mod tests {
         // The look for leases that have run out reads what runs.
         let (no_tiles, light) = (Claimant::WithoutTiles, Claimant::Light);
         let networks = Claimant::Networks;
+        let (gpu, host) = (Claimant::Gpu, Claimant::Host);
         let pool = Claimant::Pool("gpu");
         for (text, index, others) in [
             (pool.look(), "INDEX tasks_tiles", 1),
             (pool.take(), "INDEX tasks_tiles", 0),
+            (gpu.look(), "INDEX tasks_tiles", 1),
+            (gpu.take(), "INDEX tasks_tiles", 0),
+            (host.look(), "INDEX tasks_others", 1),
+            (host.take(), "INDEX tasks_others", 0),
             (no_tiles.look(), "INDEX tasks_others", 1),
             (no_tiles.take(), "INDEX tasks_others", 0),
             (light.look(), "INDEX tasks_light", 1),

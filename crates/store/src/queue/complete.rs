@@ -317,17 +317,24 @@ async fn finish(
     .execute(&mut *connection)
     .await?;
     sql!(
-        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost,
-             onnxruntime)
-             SELECT kind, 1, coalesce(seconds, 0), iterations, passes, coalesce(seconds, 0),
-                 iif(kind = 'tile', cost * fraction, cost), record ->> '$.onnxruntime'
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, onnxruntime)
+             SELECT kind, 1, coalesce(seconds, 0), iterations, passes, record ->> '$.onnxruntime'
              FROM tasks WHERE id = ?
          ON CONFLICT (kind) DO UPDATE SET tasks = tasks + 1, seconds = seconds + excluded.seconds,
              iterations = iterations + excluded.iterations, passes = passes + excluded.passes,
-             recent_seconds = 0.97 * recent_seconds + excluded.recent_seconds,
-             recent_cost = 0.97 * recent_cost + excluded.recent_cost,
              onnxruntime = coalesce(excluded.onnxruntime, onnxruntime)",
         [lease.task]
+    )
+    .execute(&mut *connection)
+    .await?;
+    sql!(
+        "INSERT INTO rates (kind, device, seconds, cost)
+             SELECT kind, coalesce((SELECT device FROM workers WHERE id = ?2), 'cpu'),
+                 coalesce(seconds, 0), iif(kind = 'tile', cost * fraction, cost)
+             FROM tasks WHERE id = ?1
+         ON CONFLICT (kind, device) DO UPDATE SET seconds = 0.97 * seconds + excluded.seconds,
+             cost = 0.97 * cost + excluded.cost",
+        [lease.task, lease.worker]
     )
     .execute(&mut *connection)
     .await?;

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use crate::columns::from_row;
 use engine::job::{JobId, Lab};
 
 /// A forecast is good for so long for each job in it, about twenty times as long as it takes to make: it
@@ -43,16 +44,39 @@ impl Forecasts {
 /// The load ahead of every unfinished job.
 #[derive(Debug)]
 pub struct Forecast {
-    workers: u32,
-    /// Seconds that a planned CPU-second of a tile takes.
-    rate: f64,
-    /// Seconds that a planned CPU-second of any other task takes: reading and writing are slower than computing.
-    others_rate: f64,
+    /// Workers that take tiles and pilots.
+    tiles: Crew,
+    /// Workers that take other tasks: reading and writing are slower than computing.
+    others: Crew,
     jobs: HashMap<JobId, Ahead>,
     /// The load ahead of a new job.
     new_job: Ahead,
     pub(super) left_by_lab: HashMap<Lab, f64>,
     until: Instant,
+}
+
+/// Workers that share tasks.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Crew {
+    pub(super) workers: u32,
+    /// Planned CPU-seconds that all of them do in a second.
+    pub(super) speed: f64,
+}
+
+from_row!(Crew, row => { workers, speed });
+
+impl Crew {
+    /// Seconds that a worker takes for a planned CPU-second: the harmonic mean.
+    fn rate(self) -> f64 {
+        f64::from(self.workers) / self.speed
+    }
+
+    /// Seconds for these tasks at a rate: if the work is shared evenly, and how much later the longest task may end.
+    fn seconds(self, left: Left, rate: f64) -> Left {
+        let workers = f64::from(self.workers);
+        let longest = (1.0 - 1.0 / workers) * rate * left.longest;
+        Left { sum: rate * left.sum / workers, longest }
+    }
 }
 
 /// Planned CPU-seconds that are left of some tasks of a job.
@@ -85,8 +109,8 @@ pub(super) struct Unfinished {
 }
 
 impl Forecast {
-    /// Seconds until a job ends, from the work left of its tiles and of its other tasks; `None` without a worker that
-    /// takes tiles. `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge about as
+    /// Seconds until a job ends, from the work left of its tiles and of its other tasks; `None` without workers for
+    /// both. `own_rate` is what a planned CPU-second of its tiles has taken so far: its tiles converge about as
     /// early as each other.
     pub(crate) fn eta_seconds(
         &self,
@@ -94,18 +118,18 @@ impl Forecast {
         (tiles, others): (Left, Left),
         own_rate: Option<f64>,
     ) -> Option<f64> {
-        let workers = f64::from(self.workers);
-        let own = own_rate.unwrap_or(self.rate);
-        let ahead = self.ahead(job).cost;
-        let left = self.rate * ahead + self.others_rate * others.sum + own * tiles.sum;
-        let longest = (self.others_rate * others.longest).max(own * tiles.longest);
-        let seconds = left / workers + (1.0 - 1.0 / workers) * longest;
-        (self.workers > 0).then_some(seconds)
+        if self.tiles.workers == 0 || self.others.workers == 0 {
+            return None;
+        }
+        let ahead = self.ahead(job).cost / self.tiles.speed;
+        let tiles = self.tiles.seconds(tiles, own_rate.unwrap_or(self.tiles.rate()));
+        let others = self.others.seconds(others, self.others.rate());
+        Some(ahead + tiles.sum + others.sum + tiles.longest.max(others.longest))
     }
 
     /// Seconds that a worker takes for planned CPU-seconds of a task that is no tile; `None` without a worker.
     pub(crate) fn other_seconds(&self, cost: f64) -> Option<f64> {
-        (self.workers > 0).then_some(self.others_rate * cost)
+        (self.others.workers > 0).then(|| self.others.rate() * cost)
     }
 
     /// The place of a job that waits among all that do, from 1.
@@ -113,13 +137,12 @@ impl Forecast {
         self.ahead(job).position
     }
 
-    /// For as many workers, which take these seconds for a planned CPU-second of tiles and of other tasks. `labs` has
-    /// the name and the share of each lab.
+    /// For the workers of tiles and those of other tasks. `labs` has the name and the share of each lab.
     pub(super) fn new(
         unfinished: &[Unfinished],
         labs: Vec<(Lab, f64)>,
-        workers: usize,
-        (rate, others_rate): (f64, f64),
+        tiles: Crew,
+        others: Crew,
     ) -> Self {
         let shares: Vec<f64> = labs.iter().map(|(_, share)| *share).collect();
         let mut left = vec![0.0; labs.len()];
@@ -131,9 +154,8 @@ impl Forecast {
             position: 1 + unfinished.iter().filter(|job| job.waits).count(),
         };
         Self {
-            workers: count(workers),
-            rate,
-            others_rate,
+            tiles,
+            others,
             jobs: ahead(unfinished, &shares),
             new_job,
             left_by_lab: labs.into_iter().map(|(lab, _)| lab).zip(left).collect(),

@@ -4,10 +4,11 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::forecast::{Forecast, Unfinished};
+use super::forecast::{Crew, Forecast, Unfinished};
 use crate::Store;
 use crate::columns::{Columns, sql, sql_as};
 use crate::error::Result;
+use crate::tables::workers::since;
 use engine::job::{JobState, Lab};
 
 /// Workers that were silent for longer do not count.
@@ -72,34 +73,28 @@ impl Store {
                 left: row.read("left")?,
             });
         }
-        let workers = self.live_tile_workers(WORKER_AGE).await?;
-        Ok(Forecast::new(&unfinished, labs, workers, self.rates().await?))
+        let (tiles, others) = (self.crew(true).await?, self.crew(false).await?);
+        Ok(Forecast::new(&unfinished, labs, tiles, others))
     }
 
-    /// Seconds that a planned CPU-second of tiles and of other tasks takes on this machine: the mean over the last tasks of
-    /// a kind, weighted by their planned cost. Each kind starts with some seconds as planned, because the first tasks may be
-    /// so small that they measure the start of a process.
-    async fn rates(&self) -> Result<(f64, f64)> {
-        const AS_PLANNED: (f64, f64) = (10.0, 1.0);
-        let row = sql!(
-            "SELECT coalesce(sum(recent_seconds) FILTER (WHERE kind = 'tile'), 0.0) AS tile_seconds,
-                 coalesce(sum(recent_cost) FILTER (WHERE kind = 'tile'), 0.0) AS tile_cost,
-                 coalesce(sum(recent_seconds)
-                     FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')), 0.0) AS other_seconds,
-                 coalesce(sum(recent_cost)
-                     FILTER (WHERE kind IN ('prepare', 'preview', 'assemble')), 0.0) AS other_cost
-             FROM totals",
+    /// The live workers of tiles, or those of other tasks. The speed of each is the mean over the last tasks on its device,
+    /// weighted by their planned cost. It starts with some seconds as planned, because the first tasks may be so small that
+    /// they measure the start of a process.
+    async fn crew(&self, of_tiles: bool) -> Result<Crew> {
+        let as_planned = if of_tiles { 10.0 } else { 1.0 };
+        sql_as!(
+            "SELECT count(*) AS workers,
+                 total((coalesce(cost, 0.0) + ?3) / (coalesce(seconds, 0.0) + ?3)) AS speed
+             FROM workers LEFT JOIN (
+                 SELECT device AS class, sum(seconds) AS seconds, sum(cost) AS cost FROM rates
+                 WHERE kind IN ('tile', 'prepare', 'preview', 'assemble') AND (kind = 'tile') = ?2
+                 GROUP BY device)
+             ON class = coalesce(device, 'cpu')
+             WHERE seen_at >= ?1 AND light = 0 AND iif(?2, tiles, others)",
+            [since(WORKER_AGE), of_tiles, as_planned]
         )
         .fetch_one(&self.readers)
-        .await?;
-        let rate = |seconds: &'static str, cost: &'static str, start: f64| -> Result<f64> {
-            Ok((row.read::<f64>(seconds)? + start) / (row.read::<f64>(cost)? + start))
-        };
-        let (tiles, others) = AS_PLANNED;
-        Ok((
-            rate("tile_seconds", "tile_cost", tiles)?,
-            rate("other_seconds", "other_cost", others)?,
-        ))
+        .await
     }
 
     /// Planned CPU-seconds left of the unfinished jobs of each lab that has any.

@@ -83,7 +83,7 @@ impl Store {
         let rows = sql!(
             "WITH running AS (
                  SELECT job, sum(cost * fraction) AS spent,
-                     sum(iif(kind = 'tile', cost * fraction, 0.0)) AS tiles_spent,
+                     sum(iif(kind IN ('tile', 'pilot'), cost * fraction, 0.0)) AS tiles_spent,
                      sum(kind = 'tile' AND delivery IS NOT 0) AS tiles_running,
                      sum(stage = ?2) AS deep, sum(stage = ?3) AS nonlocal,
                      sum(iterations) AS iterations, sum(passes) AS passes
@@ -121,8 +121,9 @@ impl Store {
     pub async fn estimate(&self, tasks: &[(TaskKind, f64)]) -> Result<Estimate> {
         let forecast = self.forecast().await?;
         let left = |of_tiles: bool| {
-            let of_kind = |kind: TaskKind| kind.tile().is_some() == of_tiles;
-            let costs = tasks.iter().filter(|(kind, _)| of_kind(*kind)).map(|(_, cost)| *cost);
+            let is_tile = |kind| matches!(kind, TaskKind::Tile { .. } | TaskKind::Pilot);
+            let is_wanted = |kind: TaskKind| is_tile(kind) == of_tiles;
+            let costs = tasks.iter().filter(|(kind, _)| is_wanted(*kind)).map(|(_, cost)| *cost);
             costs.fold(Left { sum: 0.0, longest: 0.0 }, |left, cost| Left {
                 sum: left.sum + cost,
                 longest: left.longest.max(cost),

@@ -44,6 +44,10 @@ pub enum Claimant<'a> {
     Local,
     /// One that leaves the tiles to other machines.
     WithoutTiles,
+    /// One on a GPU, which takes tiles and pilots alone.
+    Gpu,
+    /// One on the CPU beside those on a GPU, which takes all other tasks.
+    Host,
     /// One that takes short tasks alone, so that they wait for no tile. It begins no job: a job would be shown as
     /// running though nobody computes it.
     Light,
@@ -91,8 +95,8 @@ impl Store {
     ) -> Result<()> {
         let now = Timestamp::now();
         sql!(
-            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at, light, tiles)
-             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+            "INSERT INTO workers (id, pid, version, host, pool, device, started_at, seen_at, light, tiles, others)
+             VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
              ON CONFLICT (id) DO UPDATE SET seen_at = excluded.seen_at",
             [
                 id,
@@ -104,7 +108,8 @@ impl Store {
                 now,
                 now,
                 matches!(claimant, Claimant::Light | Claimant::Networks),
-                matches!(claimant, Claimant::Local | Claimant::Pool(_))
+                matches!(claimant, Claimant::Local | Claimant::Gpu | Claimant::Pool(_)),
+                !matches!(claimant, Claimant::Gpu | Claimant::Pool(_))
             ]
         )
         .execute(self.writer()?)
@@ -139,16 +144,19 @@ impl Store {
     }
 
     /// Number of workers of this machine that compute now or in a moment: those that gave a sign of life within `age`, but
-    /// at most as many as there are running tasks and tiles that are ready. Short tasks do not count.
+    /// at most as many as there are running tasks and tiles that are ready, and workers for those. Short tasks do not count.
     pub async fn busy_workers(&self, age: Duration) -> Result<usize> {
-        let live = "SELECT count(*) FROM workers WHERE seen_at >= ? AND light = 0 AND host IS NULL";
-        let live: i64 = sql_as!(live, [since(age)]).fetch_one(&self.readers).await?;
-        let tasks = "SELECT (SELECT count(*) FROM tasks
-                             WHERE state = 'running' AND light = 0 AND lease_until IS NOT NULL)
-                          + (SELECT count(*) FROM (SELECT 1 FROM tasks
-                                                   WHERE state = 'ready' AND kind = 'tile' LIMIT ?))";
-        let tasks: i64 = sql_as!(tasks, [live]).fetch_one(&self.readers).await?;
-        Ok(usize::try_from(live.min(tasks)).unwrap_or(usize::MAX))
+        let busy = "WITH live AS (SELECT count(*) AS workers, total(tiles) AS for_tiles FROM workers
+                                  WHERE seen_at >= ? AND light = 0 AND host IS NULL),
+                         running AS (SELECT count(*) AS tasks,
+                                         total(kind IN ('tile', 'pilot')) AS tiles FROM tasks
+                                     WHERE state = 'running' AND light = 0 AND lease_until IS NOT NULL)
+                    SELECT CAST(min(workers, tasks - running.tiles + min(for_tiles, running.tiles
+                        + (SELECT count(*) FROM (SELECT 1 FROM tasks INDEXED BY tasks_tiles
+                                                 WHERE state = 'ready' AND kind IN ('tile', 'pilot')
+                                                 LIMIT (SELECT workers FROM live))))) AS INTEGER)
+                    FROM live, running";
+        sql_as!(busy, [since(age)]).fetch_one(&self.readers).await
     }
 
     /// The last sign of life of any worker that takes tiles; none if there was none.
@@ -183,6 +191,6 @@ pub async fn seen(connection: &mut SqliteConnection, id: WorkerId) -> Result<()>
     Ok(())
 }
 
-fn since(age: Duration) -> i64 {
+pub fn since(age: Duration) -> i64 {
     Timestamp::now().0 - i64::try_from(age.as_millis()).unwrap_or(i64::MAX / 2)
 }

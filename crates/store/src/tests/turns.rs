@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use super::{Lab, id};
-use crate::{Claimant, Entitlement, WorkerEnd, WorkerPlace};
+use super::{LEASE, Lab, id};
+use crate::{Claimant, Entitlement, Purpose, Store, WorkerEnd, WorkerPlace};
 use engine::job::{Algorithm, JobId, TaskKind, WorkerId};
 
 fn named(name: &str) -> engine::job::Lab {
@@ -110,6 +110,55 @@ async fn priority_comes_before_turns() {
     let urgent = lab.submit_for("second", 5).await;
     let turns = lab.turns(10).await;
     assert!(turns.iter().all(|job| *job == urgent), "{turns:?}");
+}
+
+/// A GPU takes tiles and pilots, its host the other tasks. The estimate follows from the rates of the devices that live.
+#[tokio::test]
+async fn rates_of_a_gpu_and_of_a_cpu_are_independent() {
+    let lab = Lab::new().await;
+    let card = WorkerId::new();
+    let place = WorkerPlace { device: Some("gpu".into()), ..WorkerPlace::default() };
+    lab.store.worker_started(card, 2, &place, Claimant::Gpu).await.unwrap();
+    id(lab.add_for(&named("local"), Algorithm::PnpNonlocal, 0, None, b"job").await.unwrap());
+    let claim = async |claimant, worker| lab.store.claim_as(claimant, worker, LEASE).await.unwrap();
+    assert!(claim(Claimant::Gpu, card).await.is_none());
+    while let Some(task) = claim(Claimant::Host, lab.worker).await {
+        assert!(!matches!(task.kind, TaskKind::Tile { .. } | TaskKind::Pilot), "{:?}", task.kind);
+        lab.work(&task).await;
+    }
+    let pilot = claim(Claimant::Gpu, card).await.unwrap();
+    assert_eq!(pilot.kind, TaskKind::Pilot);
+    lab.work(&pilot).await;
+    // The CPU takes 100 times as long as the card, for one tile of each.
+    for (claimant, worker, milliseconds) in
+        [(Claimant::Gpu, card, 10_000), (Claimant::Local, lab.worker, 1_000_000)]
+    {
+        let task = claim(claimant, worker).await.unwrap();
+        assert!(matches!(task.kind, TaskKind::Tile { .. }));
+        sqlx::query("UPDATE attempts SET started_at = started_at - ? WHERE outcome IS NULL")
+            .bind(milliseconds)
+            .execute(&lab.store.writer)
+            .await
+            .unwrap();
+        lab.work(&task).await;
+    }
+    let eta = async || {
+        // A store that was just opened has no forecast.
+        let store = Store::open(lab.store.dir().root(), Purpose::Use).await.unwrap();
+        let tile = TaskKind::Tile { snapshot: 0, snapshots: 1, tile: 0 };
+        store.estimate(&[(tile, 10.0); 100]).await.unwrap().eta_seconds.unwrap()
+    };
+    let both = eta().await;
+    lab.store.worker_ended(card, &WorkerEnd::Left).await.unwrap();
+    let cpu = eta().await;
+    lab.store.worker_started(card, 2, &place, Claimant::Gpu).await.unwrap();
+    lab.store.worker_ended(lab.worker, &WorkerEnd::Left).await.unwrap();
+    let host = WorkerPlace { device: Some("cpu".into()), ..WorkerPlace::default() };
+    lab.store.worker_started(WorkerId::new(), 3, &host, Claimant::Host).await.unwrap();
+    let card = eta().await;
+    // The CPU does 2 % of the work of both.
+    assert!((0.9..1.05).contains(&(both / card)), "{both} {card}");
+    assert!((45.0..100.0).contains(&(cpu / card)), "{cpu} {card}");
 }
 
 #[tokio::test]
