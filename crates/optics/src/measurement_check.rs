@@ -696,12 +696,6 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
         .or_else(|| resampled_masks(figures))
         .or_else(|| shifted_masks(figures));
     let wrong = wrong.filter(|_| !figures.is_uncertain());
-    eprintln!(
-        "FIGS uncertain {} expl {:.4} local {:?}",
-        figures.is_uncertain(),
-        figures.explained_unshifted,
-        figures.local
-    );
     // The other figures need the mean brightness of the frames.
     if wrong.is_none() && (figures.is_uncertain() || figures.fits_locally()) {
         if figures.is_sparse && !figures.fits_locally() {
