@@ -130,7 +130,7 @@ impl Dispersion {
         self.offsets.len()
     }
 
-    /// True if two bands are less than half a pixel apart. Their masks resemble one another too much to tell them apart.
+    /// True if two bands are less than half a pixel apart. Their masks resemble one another too much to separate the bands.
     pub fn has_close_bands(&self) -> bool {
         let mut offsets = self.offsets.clone();
         offsets.sort_by(f64::total_cmp);
