@@ -301,7 +301,7 @@ async fn workers_on_the_cpu_take_the_other_tasks() {
     assert!(!on_cpu.iter().any(|kind| kind == "tile" || kind == "pilot"), "{on_cpu:?}");
 }
 
-/// A tile runs again if the GPU was full for a moment. If it stays full, the job fails with the remedy.
+/// A tile runs again if the GPU was full for a moment.
 #[cfg(feature = "gpu")]
 #[tokio::test]
 async fn a_tile_on_a_full_gpu_runs_again_without_networks() {
@@ -319,13 +319,6 @@ async fn a_tile_on_a_full_gpu_runs_again_without_networks() {
     assert_eq!(done["state"], "succeeded", "{done:#}");
     let failures = "SELECT coalesce(reason, outcome) FROM attempts WHERE outcome <> 'done'";
     assert_eq!(texts(&app, failures).await, [""; 0]);
-
-    std::fs::write(driver.file("memory"), "1024").unwrap();
-    let job = app.submit(&variation(&measurement, 4, 256)).await;
-    let failed = app.ended(&job).await;
-    assert_eq!(failed["state"], "failed", "{failed:#}");
-    let text = failed["error"].to_string();
-    assert!(text.contains("too little free memory") && text.contains("smaller tiles"), "{text}");
 }
 
 /// All steps of the script for machines with a card, with few iterations.

@@ -72,7 +72,10 @@ impl Device {
         let mentions = |words: &[&str]| words.iter().any(|word| lower.contains(word));
         if self == Self::Cpu {
             ReconError::Runtime(format!("network {name}: {error}"))
-        } else if mentions(&["out of memory", "out of device memory", "failed to allocate"]) {
+        } else if mentions(&["out of memory", "out of device memory", "failed to allocate"])
+            // WebGPU goes on without memory, and then refuses the buffer.
+            || mentions(&["invalid buffer"])
+        {
             ReconError::DeviceFull(format!(
                 "the GPU has too little free memory for the network {name}: choose smaller tiles, run fewer workers \
                  on this GPU, or use --device cpu ({error})"
@@ -370,9 +373,12 @@ mod tests {
             assert!(matches!(error, ReconError::DeviceLost(_)), "{error:?}");
             assert!(matches!(Device::Cpu.failure("n", text), ReconError::Runtime(_)));
         }
-        for text in
-            ["VK_ERROR_OUT_OF_DEVICE_MEMORY", "CUDA out of memory", "Failed to allocate buffer"]
-        {
+        for text in [
+            "VK_ERROR_OUT_OF_DEVICE_MEMORY",
+            "CUDA out of memory",
+            "Failed to allocate buffer",
+            "WebGPU validation failed. [Invalid Buffer (unlabeled)] is invalid due to a previous error.",
+        ] {
             let error = Device::Gpu.failure("n", text);
             assert!(matches!(error, ReconError::DeviceFull(_)), "{error:?}");
             assert!(error.to_string().contains("smaller tiles"), "{error}");
