@@ -192,7 +192,6 @@ impl FaultyDriver {
             ("FAULTY_GPU_DRIVER", self.original.to_str().unwrap().to_owned()),
             ("FAULTY_GPU_LOSS", self.file("loss")),
             ("FAULTY_GPU_FULL", self.file("full")),
-            ("FAULTY_GPU_MEMORY", self.file("memory")),
         ];
         let environment: Vec<_> =
             environment.iter().map(|(name, value)| (*name, &**value)).collect();
