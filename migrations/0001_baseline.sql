@@ -266,7 +266,7 @@ CREATE TABLE job_sums (
     job            TEXT PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE,
     -- Planned CPU-seconds: of all tasks, of the remaining ones, and of the longest remaining one.
     cost           REAL NOT NULL,
-    tiles_left     REAL NOT NULL, -- with the pilot
+    tiles_left     REAL NOT NULL,
     tiles_longest  REAL NOT NULL,
     others_left    REAL NOT NULL,
     others_longest REAL NOT NULL,
@@ -334,8 +334,7 @@ CREATE TABLE workers (
     started_at INTEGER NOT NULL,
     seen_at    INTEGER NOT NULL,
     light      INTEGER NOT NULL DEFAULT 0, -- 1 if it takes short tasks only
-    tiles      INTEGER NOT NULL DEFAULT 1, -- 1 if it takes tiles
-    others     INTEGER NOT NULL DEFAULT 1  -- 1 if it takes other tasks of jobs
+    tiles      INTEGER NOT NULL DEFAULT 1  -- 1 if it takes tiles
 ) STRICT, WITHOUT ROWID;
 
 CREATE TABLE tile_workers (
@@ -346,21 +345,15 @@ CREATE TABLE tile_workers (
 
 CREATE TABLE totals (
     -- Counters by kind of task that only grow, although jobs are deleted.
-    kind        TEXT PRIMARY KEY,
-    tasks       INTEGER NOT NULL,
-    seconds     REAL NOT NULL,
-    iterations  INTEGER NOT NULL,
-    passes      INTEGER NOT NULL,
-    onnxruntime TEXT -- its version, as reported with the last task that used it
-) STRICT, WITHOUT ROWID;
-
-CREATE TABLE rates (
-    -- Fading sums over the last tasks of a kind on a device.
-    kind    TEXT NOT NULL,
-    device  TEXT NOT NULL, -- as in `workers`
-    seconds REAL NOT NULL, -- duration
-    cost    REAL NOT NULL, -- planned CPU-seconds that were really used
-    PRIMARY KEY (kind, device)
+    kind           TEXT PRIMARY KEY,
+    tasks          INTEGER NOT NULL,
+    seconds        REAL NOT NULL,
+    iterations     INTEGER NOT NULL,
+    passes         INTEGER NOT NULL,
+    -- Fading sums over the last tasks: duration, and planned CPU-seconds that were really used.
+    recent_seconds REAL NOT NULL DEFAULT 0,
+    recent_cost    REAL NOT NULL DEFAULT 0,
+    onnxruntime    TEXT -- its version, as reported with the last task that used it
 ) STRICT, WITHOUT ROWID;
 
 CREATE TABLE tasks (
@@ -425,9 +418,8 @@ CREATE INDEX tasks_running ON tasks (job) WHERE state = 'running';
 -- Each claimant has two: by lab, and by job. They hold no other tasks than those that it may take.
 CREATE INDEX tasks_ready ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready';
 CREATE INDEX tasks_ready_of_job ON tasks (job, ordinal) WHERE state = 'ready';
-CREATE INDEX tasks_tiles ON tasks (lab, priority DESC, job, ordinal)
-    WHERE state = 'ready' AND kind IN ('tile', 'pilot');
-CREATE INDEX tasks_tiles_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND kind IN ('tile', 'pilot');
+CREATE INDEX tasks_tiles ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND kind = 'tile';
+CREATE INDEX tasks_tiles_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND kind = 'tile';
 CREATE INDEX tasks_others ON tasks (lab, priority DESC, job, ordinal) WHERE state = 'ready' AND kind <> 'tile';
 CREATE INDEX tasks_others_of_job ON tasks (job, ordinal) WHERE state = 'ready' AND kind <> 'tile';
 CREATE INDEX tasks_light ON tasks (lab, priority DESC, ordinal) WHERE state = 'ready' AND light = 1 AND job IS NULL;

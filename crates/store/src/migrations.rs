@@ -6,8 +6,10 @@ use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::{SqlSafeStr, SqlitePool};
 
 /// Number, name and text of every migration, in order.
-const MIGRATIONS: &[(i64, &str, &str)] =
-    &[(1, "baseline", include_str!("../../../migrations/0001_baseline.sql"))];
+const MIGRATIONS: &[(i64, &str, &str)] = &[
+    (1, "baseline", include_str!("../../../migrations/0001_baseline.sql")),
+    (2, "rates of devices", include_str!("../../../migrations/0002_rates_of_devices.sql")),
+];
 
 /// Name of the first migration before version 0.1.0, whose databases this program does not read.
 pub const BEFORE_BASELINE: &str = "init";
@@ -27,6 +29,12 @@ impl Schema {
             Migration::new(number, Cow::Borrowed(name), simple, text.into_sql_str(), false)
         };
         Self(Migrator::with_migrations(migrations.map(migration).collect()))
+    }
+
+    /// The schema of the baseline.
+    #[cfg(test)]
+    pub fn first() -> Self {
+        Self::with(MIGRATIONS.iter().copied().take(1))
     }
 
     /// The schema of a version that has one more migration.

@@ -59,6 +59,24 @@ fn saved(folder: &Path) -> Vec<PathBuf> {
 }
 
 #[tokio::test]
+async fn the_rates_of_the_baseline_are_those_of_the_cpu() {
+    let folder = tempfile::tempdir().unwrap();
+    let baseline = Store::open_with(folder.path(), SERVE, &Schema::first()).await.unwrap();
+    baseline.close().await;
+    let mut connection = connect(&folder.path().join("sci-recon.db")).await;
+    let total =
+        "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
+                 VALUES ('tile', 3, 9.0, 1, 1, 6.0, 4.0)";
+    sqlx::query(total).execute(&mut connection).await.unwrap();
+    connection.close().await.unwrap();
+    let store = Store::open(folder.path(), SERVE).await.unwrap();
+    let rates = sqlx::query_as("SELECT kind, device, seconds, cost FROM rates");
+    let rates: Vec<(String, String, f64, f64)> = rates.fetch_all(&store.readers).await.unwrap();
+    assert_eq!(rates, [("tile".to_owned(), "cpu".to_owned(), 6.0, 4.0)]);
+    assert_eq!(saved(folder.path()).len(), 1);
+}
+
+#[tokio::test]
 async fn the_database_is_saved_before_it_is_brought_up_to_date() {
     let folder = folder().await;
     assert!(saved(folder.path()).is_empty(), "nothing is saved that is up to date");
