@@ -394,13 +394,19 @@ const APERTURE_CONTRAST: Range<f32> = -1.6..-1.0;
 /// Smallest distance of the hybrid aperture's mask gradient above its contrast, in decimal logarithms.
 const APERTURE_SHARPNESS: f32 = 0.28;
 
+/// Mask gradient that a block with light does not reach, in decimal logarithms. An isolated open pixel has 0.3.
+const DARK_GRADIENT: f32 = 1.0;
+
 /// True if predictions are uncertain behind the masks of these [`block_features`]. Such masks are blurred, or leak light
 /// through closed pixels, until they are at least as highly correlated as those of the hybrid coded aperture.
 fn unfamiliar_masks(features: &Array3<BlockFeatures>) -> bool {
     let blocks = features.index_axis(Axis(0), 0);
-    // A block that no light reaches has neither contrast nor gradient. Equal masks have no contrast.
-    let is_lit =
-        |block: &&BlockFeatures| block.mask_contrast.max(block.mask_gradient) > logarithm(0.0);
+    // A block that no light reaches has no contrast, and only beside light a gradient. Equal masks have no contrast.
+    let is_lit = |block: &&BlockFeatures| {
+        let floor = logarithm(0.0);
+        block.mask_contrast > floor
+            || block.mask_gradient > floor && block.mask_gradient < DARK_GRADIENT
+    };
     let lit = || blocks.iter().filter(is_lit);
     let mean =
         |value: fn(&BlockFeatures) -> f32| lit().map(value).sum::<f32>() / lit().count() as f32;
@@ -574,6 +580,9 @@ mod tests {
         assert!(!softened(iid(), 0.0, 0.3));
         assert!(softened(iid(), 1.2, 0.0));
         assert!(!softened(squares(), 0.0, 0.0));
+        let row = iid_masks(1, 1, 64, 3).unwrap();
+        let equal = row.broadcast((10, 64, 64)).unwrap().to_owned();
+        assert!(unfamiliar(equal), "equal masks");
         // A corner without light.
         let mut dark = squares();
         dark.slice_mut(s![.., ..32, ..32]).fill(0.0);
