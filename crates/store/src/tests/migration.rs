@@ -61,8 +61,8 @@ fn saved(folder: &Path) -> Vec<PathBuf> {
 #[tokio::test]
 async fn the_rates_of_the_baseline_are_those_of_the_cpu() {
     let folder = tempfile::tempdir().unwrap();
-    let baseline = Store::open_with(folder.path(), SERVE, &Schema::first()).await.unwrap();
-    baseline.close().await;
+    let baseline = Store::open_with(folder.path(), SERVE, &Schema::first()).await;
+    baseline.unwrap().close().await;
     let mut connection = connect(&folder.path().join("sci-recon.db")).await;
     let total =
         "INSERT INTO totals (kind, tasks, seconds, iterations, passes, recent_seconds, recent_cost)
