@@ -439,12 +439,13 @@ export async function moved(page, checks) {
 
 /** Watches a job until it has succeeded; its tiles must appear before that. */
 export async function watch(page, checks) {
+  const bar = await page.waitForSelector(".progressline progress");
+  const before = await bar.evaluate((bar) => bar.value);
   await page.waitForSelector(".tile.done", { timeout: 120_000 });
   await checks.text(page, ".head h1", (name) => name === HOSTILE, "the name is shown as text");
   checks.that((await page.$$("main img")).length === 0, "the name creates no element");
-  const bar = () => page.$eval(".progressline progress", (bar) => bar.value);
-  const before = await bar();
-  await page.waitForFunction((before) => document.querySelector(".progressline progress").value > Math.min(before, 99), before, { timeout: 120_000 });
+  // The bar is removed when the job ends.
+  await page.waitForFunction((before) => (document.querySelector(".progressline progress")?.value ?? 100) > before, before, { timeout: 120_000 });
   const line = await page.textContent(".progressline");
   checks.that(!/iterations/.test(line) && !/≤/.test(line), `the progress shows no iterations, which belong to one tile: ${line}`);
   // Unfinished frames are marked.
