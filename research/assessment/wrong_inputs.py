@@ -391,8 +391,8 @@ KINDS = [
     Kind('a part of the sensor with one value near black', ('unmodulated_area', 'bad_pixels'), nearly_black),
     Kind('stray light with a peak of 3 times the mean', ('unmodulated_area',), stray_light(3)),
     Kind('stray light with a peak of 1.5 times the mean', ('unmodulated_area',), stray_light(1.5)),
-    Kind('stray light with a peak of the mean', ('unmodulated_area',), stray_light(1), HIDDEN),
-    Kind('stray light with a peak of 0.7 times the mean', ('unmodulated_area',), stray_light(.7), HIDDEN),
+    Kind('stray light with a peak of the mean', ('unmodulated_area',), stray_light(1)),
+    Kind('stray light with a peak of 0.7 times the mean', ('unmodulated_area',), stray_light(.7)),
     Kind('a snapshot of 0', ('refused: 0',), lambda s: taken(s, y=s.dark)),
     Kind('a mask instead of the snapshot', ('binary_measurement', 'foreign_masks'), lambda s: taken(s, y=s.masks[0], dark=None)),
 

@@ -503,8 +503,6 @@ fn brightest(strips: &[Strip], offset: f64) -> (f64, f64) {
     (brightest, sorted(ENOUGH_LIGHT * mean_light).last().copied().unwrap_or(brightest))
 }
 
-/// The colour difference on which neighbouring blocks agree.
-///
 /// The diagonals of a cell: phases that may be green, and the other two.
 const DIAGONALS: [([usize; 2], [usize; 2]); 2] = [([1, 2], [0, 3]), ([0, 3], [1, 2])];
 
@@ -529,6 +527,8 @@ impl Colours {
     }
 }
 
+/// The colour difference on which neighbouring blocks agree.
+///
 /// A mosaic has two green phases on a diagonal of its cell. The differences between the other two, and between them and
 /// green, follow the colours of the scene, which change slowly. The texture of a grey scene has no preferred diagonal, and its
 /// sign changes from block to block. Stripes differ on both diagonals.
@@ -582,16 +582,16 @@ fn phase_difference(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> Ph
     let count = strips.len() as f64;
     let measured: Vec<f64> = strips.iter().map(|strip| strip.measured.sum()).collect();
     let total: f64 = measured.iter().sum();
-    let residuals = |phase: usize| -> Vec<(f64, &f64)> {
+    let residuals = [0, 1, 2, 3].map(|phase: usize| -> Vec<(f64, &f64)> {
         let residual = |strip: &Strip| {
             let explained =
                 strip.mask_phases.iter().zip(brightness).map(|(mask, x)| mask[phase] * x);
             (strip.y_phases[phase] - explained.sum::<f64>()) / mean
         };
         strips.iter().map(residual).zip(&measured).collect()
-    };
-    let averages: [f64; 4] = [0, 1, 2, 3].map(|phase| {
-        residuals(phase).iter().map(|(residual, weight)| residual * **weight).sum::<f64>() / total
+    });
+    let averages = residuals.each_ref().map(|residuals| {
+        residuals.iter().map(|(residual, weight)| residual * **weight).sum::<f64>() / total
     });
     let has_equal_greens = |green: [usize; 2], other: [usize; 2]| {
         let colours = Colours::new(&averages, green, other);
@@ -604,7 +604,7 @@ fn phase_difference(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> Ph
     }
     let difference = |phase: usize| {
         let average = averages[phase];
-        let scatter = residuals(phase)
+        let scatter = residuals[phase]
             .iter()
             .map(|(residual, weight)| ((residual - average) * **weight).powi(2))
             .sum::<f64>();

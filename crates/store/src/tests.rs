@@ -425,14 +425,19 @@ async fn workers_are_busy_as_far_as_there_are_tasks_for_them() {
     }
     let busy = async || lab.store.busy_workers(LEASE).await.unwrap();
     assert_eq!(busy().await, 0);
-    lab.submit(0).await;
-    let mut beside_tile = Vec::new();
-    while let Some(task) = lab.claim().await {
-        if matches!(task.kind, TaskKind::Tile { .. }) {
-            beside_tile.push(busy().await);
+    // Does a job, and returns the number of busy workers during each tile.
+    let beside_tiles = async || {
+        lab.submit(0).await;
+        let mut counts = Vec::new();
+        while let Some(task) = lab.claim().await {
+            if matches!(task.kind, TaskKind::Tile { .. }) {
+                counts.push(busy().await);
+            }
+            lab.work(&task).await;
         }
-        lab.work(&task).await;
-    }
+        counts
+    };
+    let mut beside_tile = beside_tiles().await;
     let last = beside_tile.pop();
     assert_eq!(last, Some(1), "the last tile is computed alone");
     assert!(beside_tile.len() > 1 && beside_tile.iter().all(|busy| *busy == 2), "{beside_tile:?}");
@@ -442,15 +447,7 @@ async fn workers_are_busy_as_far_as_there_are_tasks_for_them() {
         .execute(&lab.store.writer)
         .await
         .unwrap();
-    lab.submit(0).await;
-    let mut beside_tile = Vec::new();
-    while let Some(task) = lab.claim().await {
-        if matches!(task.kind, TaskKind::Tile { .. }) {
-            beside_tile.push(busy().await);
-        }
-        lab.work(&task).await;
-    }
-    assert_eq!(beside_tile, [1; 4], "one worker takes tiles");
+    assert_eq!(beside_tiles().await, [1; 4], "one worker takes tiles");
 }
 
 #[tokio::test]

@@ -80,7 +80,7 @@ pub fn causes_first(findings: &mut [Finding]) {
     findings.sort_by_key(|finding| !finding.is(FindingCode::MaskValues));
 }
 
-/// Checks a few snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. MaskLight a mosaic only
+/// Checks a few snapshots \[S,H,W\] against masks \[B,H,W\], both in prepared files. Behind a mosaic only
 /// the first green sub-image is checked. `dark_subtracted` is true if dark frames were subtracted.
 ///
 /// Errors: files that can't be read.

@@ -86,7 +86,7 @@ pub fn read_snapshots(
 }
 
 /// Reads the true frames \[S B,H,W\] of the snapshots `which`, from a file that has those of these snapshots or of all
-/// `snapshots`. `None` if a .mat scene has no truth. MaskLight a mosaic the truth may be in colour \[S B,H,3W\], as the
+/// `snapshots`. `None` if a .mat scene has no truth. Behind a mosaic the truth may be in colour \[S B,H,3W\], as the
 /// returned channels indicate.
 ///
 /// Errors: as [`Source::open`]; [`IntakeError::Size`] for other sizes.

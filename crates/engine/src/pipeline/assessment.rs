@@ -145,8 +145,8 @@ pub struct Expected {
 
 /// Combines the assessments of tiles into that of a snapshot. `shares` has the runs that contain the snapshot, each
 /// with the assessments of its tiles in the plan's order. `normalisation` is the solver's scale, and `white_level` the peak
-/// of the PSNR. With a dispersion, frames are `bands`, which neither move nor have an order in time. A snapshot without light gets
-/// no figures. `None` if a tile has none.
+/// of the PSNR. With a dispersion, frames are `bands`, which neither move nor have an order in time. A snapshot without
+/// light gets no figures. `None` if a tile has none.
 pub fn expected(
     plan: &TilePlan,
     shares: &[(RunShare, Vec<Option<TileAssessment>>)],
