@@ -363,8 +363,8 @@ impl<'a> Input<'a> {
         let Snapshots { first, last } = arguments.snapshots;
         let SnapshotFileArguments { dark, saturation, .. } = &arguments.snapshot_file;
         let exposure = Exposure { dark: dark.clone(), saturation: *saturation };
-        let behind =
-            MaskLight { light: masks.array.sum_axis(ndarray::Axis(0)), mosaic: arguments.mosaic };
+        let mask_frames = masks.array.outer_iter().map(|mask| Ok(mask.to_owned()));
+        let behind = MaskLight::of(mask_frames, sensor, arguments.mosaic)?;
         let read = read_snapshots(&sources.measurement, &exposure, &behind, (first, last))
             .map_err(|error| CliError::from(error).about(Role::Measurement))?;
         let (measurement, snapshots) = (read.measurement, read.count);

@@ -37,7 +37,7 @@ pub use block_fit::{BLOCK_MARGIN, BlockFit, BlockStudy, judge_blocks};
 pub use calibration::{Average, Calibrator, RawMask, References, Repeats};
 pub use calibration_check::{CaptureFigures, PatternFigures, judge_captures, judge_masks};
 pub use camera::{Camera, illumination};
-pub use defects::{Defects, judge_defects, judge_light};
+pub use defects::{Defects, closed_pixels, judge_closed, judge_defects};
 pub use dispersion::{Dispersion, DispersionAxis, DispersionError, MAX_BANDS, MaskExtent};
 pub use displacement::{Displacement, Magnified, central, displacement, magnification, magnified};
 pub use distortion::{Distortion, MovedParts};

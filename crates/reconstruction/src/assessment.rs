@@ -183,9 +183,12 @@ pub enum Coverage {
 /// Smallest share of the pixels of a block that must be measured.
 const MIN_MEASURED: f32 = 1.0 / 16.0;
 
-/// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\] behind masks with the sum `light` \[H,W\]. NaN
-/// of `y` were not measured, also where the light is 0: the masks there may be unknown.
-pub fn coverage(y: ArrayView3<'_, f32>, light: ArrayView2<'_, f32>) -> Array3<Coverage> {
+/// Masks with smaller values only are closed, even if they leak.
+const OPEN: f32 = 0.05;
+
+/// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\] behind masks whose largest value at each
+/// pixel is `largest` \[H,W\]. NaN of `y` were not measured, also where all masks are 0: they may be unknown there.
+pub fn coverage(y: ArrayView3<'_, f32>, largest: ArrayView2<'_, f32>) -> Array3<Coverage> {
     let (snapshots, height, width) = y.dim();
     let (rows, columns) = blocks(height, width);
     let mut all = Array3::from_elem((snapshots, rows, columns), Coverage::Measured);
@@ -194,8 +197,11 @@ pub fn coverage(y: ArrayView3<'_, f32>, light: ArrayView2<'_, f32>) -> Array3<Co
     };
     for (y, mut all) in y.outer_iter().zip(all.outer_iter_mut()) {
         let is_dark = y.iter().all(|value| value.is_nan() || *value == 0.0);
-        let measured = share(&|i, j| light[[i, j]] > 0.0 && !y[[i, j]].is_nan());
-        let closed = share(&|i, j| light[[i, j]] == 0.0 && !y[[i, j]].is_nan());
+        let measured = share(&|i, j| largest[[i, j]] > 0.0 && !y[[i, j]].is_nan());
+        let closed = share(&|i, j| match y[[i, j]].is_nan() {
+            true => (f32::MIN_POSITIVE..OPEN).contains(&largest[[i, j]]),
+            false => largest[[i, j]] == 0.0,
+        });
         Zip::from(&mut all).and(&measured).and(&closed).for_each(|block, measured, closed| {
             *block = match () {
                 () if *measured < MIN_MEASURED && *closed > 0.5 => Coverage::Closed,

@@ -17,7 +17,7 @@ use formats::validate::{MaskStatistics, check_masks, check_snapshots};
 use formats::{
     self, Expected, FormatError, FrameReader, Limits, SampleType, Selection, StackInfo, Wanted,
 };
-use optics::{BitUsage, Defects, judge_defects, judge_light};
+use optics::{BitUsage, Defects, closed_pixels, judge_closed, judge_defects};
 
 /// Number of snapshots that findings of one kind name.
 const SNAPSHOTS: usize = 8;
@@ -35,23 +35,46 @@ pub struct Exposure {
 #[derive(Debug)]
 pub struct MaskLight {
     /// Sum of the masks \[H,W\]; NaN where the calibration has none.
-    pub light: Array2<f32>,
-    pub mosaic: Option<Mosaic>,
+    light: Array2<f32>,
+    /// True for pixels without an open mask.
+    is_closed: Array2<bool>,
+    mosaic: Option<Mosaic>,
 }
 
 impl MaskLight {
-    /// The sum of masks \[B,H,W\] in a prepared file, read one by one.
+    /// The light of masks \[B,H,W\] in a prepared file, read one by one.
     ///
     /// Errors: a file that can't be read.
     pub fn stored(masks: &Path, mosaic: Option<Mosaic>, limits: &Limits) -> Result<Self> {
         let masks = Reader::open(masks, limits)?;
         let (height, width) = (masks.info().height, masks.info().width);
-        let mut light = Array2::zeros((height, width));
-        for frame in 0..masks.info().frames {
+        let frames = (0..masks.info().frames).map(|frame| {
             let mask = masks.read_window(frame..frame + 1, 0..height, 0..width)?;
-            light += &mask.index_axis(Axis(0), 0);
+            Ok(mask.index_axis_move(Axis(0), 0))
+        });
+        Self::of(frames, (height, width), mosaic)
+    }
+
+    /// The light of masks of a size.
+    ///
+    /// Errors: the first one of `masks`.
+    pub fn of(
+        masks: impl IntoIterator<Item = Result<Array2<f32>>>,
+        size: (usize, usize),
+        mosaic: Option<Mosaic>,
+    ) -> Result<Self> {
+        let (mut light, mut largest) = (Array2::zeros(size), Array2::zeros(size));
+        for mask in masks {
+            let mask = mask?;
+            light += &mask;
+            largest.zip_mut_with(&mask, |largest: &mut f32, mask| *largest = largest.max(*mask));
         }
-        Ok(Self { light, mosaic })
+        ndarray::Zip::from(&mut largest).and(&light).for_each(|largest, light| {
+            if light.is_nan() {
+                *largest = f32::NAN;
+            }
+        });
+        Ok(Self { light, is_closed: closed_pixels(largest.view()), mosaic })
     }
 }
 
@@ -111,7 +134,7 @@ fn check_count(opened: &Opened) -> Result<()> {
 }
 
 /// Reads a measurement, subtracts the dark frames, divides by the full scale, and passes each snapshot \[H,W\] to
-/// `sink`. Pixels that are saturated, bad or not measured become NaN. Returns findings on the bit depth, and on snapshots
+/// `sink`. Pixels that are saturated, bad, not measured, or hardly lit by any mask become NaN. Returns findings on the bit depth, and on snapshots
 /// with pixels that carry no information.
 ///
 /// Errors: [`IntakeError::Size`] for dark frames of another size; [`IntakeError::Format`] for unreadable files and
@@ -135,7 +158,7 @@ pub fn measurement(
     let judge = |bits: BitUsage| bits.judge(full_scale.value(), saturation.unwrap_or(f32::MAX));
     // Saturation explains why no value is larger, so it comes first.
     let mut findings = defect_findings(&exposed.defects, info.height * info.width);
-    findings.extend(judge_light(behind.light.view()).map(Finding::from));
+    findings.extend(judge_closed(behind.is_closed.view()).map(Finding::from));
     findings.extend(exposed.bits.and_then(judge).map(Finding::from));
     findings.extend(dark.into_iter().take(SNAPSHOTS).map(|(snapshot, state)| {
         let finding = Finding::new(FindingCode::EmptySnapshot, format!("the snapshot {state}"));
@@ -226,11 +249,18 @@ impl FrameReader for CorrectedReader<'_> {
         if let Some(bits) = &mut self.bits {
             bits.add(&frame);
         }
-        let MaskLight { light, mosaic } = self.behind;
+        let MaskLight { light, is_closed, mosaic } = self.behind;
         if frame.dim() == light.dim() {
             let step = if mosaic.is_some() { 2 } else { 1 };
             let how = (step, self.stated);
             self.defects.push(Defects::mark(&mut frame, self.dark.as_ref(), light.view(), how));
+            // Masks of 0 are ignored by the solver, those that leak are not.
+            let leaks = ndarray::Zip::from(is_closed).and(light);
+            leaks.and(&mut frame).for_each(|closed, light, value| {
+                if *closed && *light > 0.0 {
+                    *value = f32::NAN;
+                }
+            });
         }
         if let Some(dark) = &self.dark {
             frame -= dark;
