@@ -64,6 +64,40 @@ fn codes(findings: &Value) -> Vec<&str> {
 
 const TV: [&str; 4] = ["--algorithm", "gap-tv", "--iterations", "60"];
 
+/// The solver would amplify the noise of a leak, which would set the white level and with it the expected PSNR.
+#[test]
+fn pixels_that_hardly_any_mask_lights_are_left_out() {
+    let found = |is_dim: fn(usize, usize) -> bool, leak: f32| {
+        let mut masks = masks();
+        let dim = |at: usize| is_dim(at % PIXELS / 96, at % 96);
+        masks.iter_mut().enumerate().filter(|(at, _)| dim(*at)).for_each(|(_, c)| *c *= leak);
+        let y = |at: usize| -> f32 {
+            let noise = (at * 7919 % 1013) as f32 / 1013.0 - 0.5;
+            (0..8).map(|k| masks[k * PIXELS + at] * pixel(k, at)).sum::<f32>() + 0.2 * noise
+        };
+        reconstruct(&masks, float((0..PIXELS).map(y)), &TV).0
+    };
+    let plain = found(|_, _| false, 1.0);
+    let areas: [(fn(usize, usize) -> bool, bool); 3] = [
+        (|row, column| row < 3 || column == 95, false),
+        (|_, column| column >= 64, true),
+        (|row, column| (row as f32 - 32.0).hypot(column as f32 - 48.0) > 36.0, true),
+    ];
+    for (which, (is_dim, is_area)) in areas.into_iter().enumerate() {
+        for leak in [0.005, 0.02] {
+            let dim = found(is_dim, leak);
+            let figure = |report: &Value, name: &str| report[name].as_f64().unwrap();
+            let rise = figure(&dim, "white_level") / figure(&plain, "white_level");
+            assert!((0.9..1.1).contains(&rise), "area {which}, {leak}: {rise}");
+            let expected = |report: &Value| report["assessment"]["psnr_db"].as_f64().unwrap();
+            let gain = expected(&dim) - expected(&plain);
+            assert!(gain < 1.0, "area {which}, {leak}: {gain} dB");
+            let reported = codes(&dim["findings"]).contains(&"dead_pixels");
+            assert_eq!(reported, is_area, "area {which}, {leak}: {dim:#}");
+        }
+    }
+}
+
 #[test]
 fn saturated_pixels_are_found_at_any_depth_and_left_out() {
     let (masks, y) = (masks(), snapshot());

@@ -63,8 +63,10 @@ pub struct BlockFit {
     /// Mean share of the energy that the masks explain beyond those of other blocks, relative to the rest of these: the
     /// largest after a displacement along the dispersion.
     pub gain: f64,
-    /// Standard error of `gain`.
+    /// Standard error of `gain`, as if masks of the measurement had none: a cautious one.
     pub error: f64,
+    /// Standard error of `gain` from its scatter between the blocks; infinite for up to three blocks.
+    pub scatter: f64,
     /// The gain of the right masks if all bands have the same light.
     pub expected: f64,
     /// The shift (rows, columns) of the masks, in pixels, with the largest gain; none if it is along the dispersion.
@@ -275,8 +277,13 @@ impl BlockStudy {
         }
         let squares = sum(&|block| (block.explained[unshifted] - block.elsewhere).powi(2));
         let changes = sum(&|block| (block.explained[at] - block.explained[unshifted]).powi(2));
+        let count = self.blocks.len() as f64;
+        // The variance of the t distribution allows for few blocks.
+        let variance =
+            (squares - (own - elsewhere).powi(2) / count).max(0.0) / (count - 3.0).max(0.0);
         Some(BlockFit {
             gain: (own - elsewhere) / left,
+            scatter: if count > 3.0 { (variance * count).sqrt() / left } else { f64::INFINITY },
             error: squares.sqrt() / left,
             expected: sum(&|block| block.expected) / self.blocks.len() as f64,
             // Masks that fit at a later pixel have moved back.
@@ -323,9 +330,13 @@ pub fn judge_blocks(fit: Option<&BlockFit>) -> Option<Finding> {
             format!("{figures}: it was probably recorded with other masks, or these are turned");
         return Some(Finding::new(FindingCode::ForeignMasks, detail));
     }
-    let is_recognised = fit.gain - RECOGNISED * fit.error > MIN_GAIN * fit.expected;
+    let is_recognised = fit.gain - RECOGNISED * fit.scatter > MIN_GAIN * fit.expected;
     (!is_recognised).then(|| {
-        unverified(format!("{figures}, with a standard error of {:.1} %", percent(fit.error)))
+        let certainty = match fit.scatter.is_finite() {
+            true => format!("with a standard error of {:.1} %", percent(fit.scatter)),
+            false => "and three blocks or fewer are too few to tell".to_owned(),
+        };
+        unverified(format!("{figures}, {certainty}"))
     })
 }
 
@@ -410,6 +421,27 @@ mod tests {
     fn periodic_masks_have_no_comparison() {
         let mask = Array2::from_shape_fn((192, 192), |(i, j)| f32::from((i * 5 + j) % 16 < 4));
         assert_eq!(code(mask.view(), &measurement(mask.view())), Some("unverified_masks"));
+    }
+
+    /// Five blocks of a bright scene, with and without noise.
+    #[test]
+    fn few_blocks_of_a_bright_scene_show_the_masks() {
+        let drawn = iid_masks(2, 64, 64, 4).unwrap();
+        let (mask, other) = (drawn.slice(s![0, .., ..]), drawn.slice(s![1, .., ..]));
+        let mut y = Array2::<f32>::zeros((64, 64 + 2 * (BANDS - 1)));
+        for band in 0..BANDS {
+            let light = |(i, j): (usize, usize)| {
+                0.5 + 0.3 * ((i + band) as f32 / 9.0).sin() * (j as f32 / 8.0).cos()
+            };
+            let frame = Array2::from_shape_fn((64, 64), |at| light(at) * mask[at]);
+            y += &dispersion().shear(frame.view(), band);
+        }
+        for noise in [0.0, 0.02] {
+            let y = noisy(y.clone(), noise, 7).unwrap();
+            assert_eq!(code(mask, &y), None, "noise {noise}");
+            assert!(code(other, &y).is_some(), "noise {noise}");
+            assert!(code(mask.slice(s![..;-1, ..]), &y).is_some(), "noise {noise}");
+        }
     }
 
     #[test]

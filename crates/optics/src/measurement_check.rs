@@ -16,7 +16,7 @@ use super::calibration_check::mask_scale;
 use super::distortion::{Distortion, MovedParts, Region, distortion, moved_parts};
 use super::mask_values::{Alteration, Observed, alteration};
 use super::measurement_fit::{
-    BLOCK, Fit, LocalFit, Strip, brightness_errors, equal_weights, reweighted,
+    BLOCK, Fit, LocalFit, MIN_STRIPS, Strip, brightness_errors, equal_weights, reweighted,
 };
 use super::modulation::{Run, Unmodulated, unmodulated};
 use super::{Finding, FindingCode};
@@ -48,9 +48,10 @@ const MIN_UNEVEN: f64 = 0.12;
 const UNEVEN_SIGNIFICANCE: f64 = 3.2;
 /// Offsets below this share of the mean are not reported.
 const OFFSET_SHARE: f64 = 0.03;
-/// A block counts as negative if its mean is below minus this share of the mean of the measurement. The noise of a
-/// block's mean is an eighth of a pixel's, so noise does not reach that far.
+/// A block counts as negative if its mean is below 0 by more than this share of the mean of the measurement, and by more
+/// than this many standard errors.
 const NEGATIVE_SHARE: f64 = 0.05;
+const NEGATIVE_SIGNIFICANCE: f64 = 4.0;
 /// Plausible brightness of the brightest parts of a scene, as a share of the full scale.
 const PLAUSIBLE_BRIGHTNESS: RangeInclusive<f64> = 0.12..=1.1;
 /// The brightest parts are the blocks from this quantile on.
@@ -65,6 +66,8 @@ const MIN_INVERTED: f64 = 0.05;
 const MIN_NEGATIVE: f64 = 0.5;
 /// Masks that explain less than this share of the fine structure show no displacement.
 const MIN_EXPLAINED: f64 = 0.02;
+/// From this expected share on, masks that explain less than [`MIN_EXPLAINED`] are others.
+const ENOUGH_EXPECTED: f64 = 0.08;
 /// Masks that explain this share of a sparse scene are checked as those of others.
 const ENOUGH_EXPLAINED: f64 = 0.1;
 /// Masks whose balance is below this have a nearly constant sum. The mean light of the frames then leaves no fine structure.
@@ -136,6 +139,8 @@ pub struct MeasurementFigures {
     pub explained: f64,
     /// Share of the measurement's fine structure that the masks explain without a shift.
     pub explained_unshifted: f64,
+    /// Share of the fine structure that the right masks of a uniform scene explain; less than 1 with noise and texture.
+    pub expected: f64,
     /// Gain of the shift, as a multiple of the gain expected from chance for the brightness of one frame.
     pub shift_significance: f64,
     /// Largest difference between pixels of even and odd rows and columns that the masks do not explain.
@@ -325,8 +330,10 @@ impl MeasurementStudy {
             || self.strips.iter().flat_map(|strip| strip.y_means.iter().zip(&strip.measured));
         let measured = self.pixels / (BLOCK * BLOCK) as f64;
         let mean = blocks().map(|(mean, measured)| mean * measured).sum::<f64>() / measured;
-        let limit = -NEGATIVE_SHARE * mean.abs();
-        let negative = blocks().filter(|(mean, _)| **mean < limit).map(|(_, measured)| measured);
+        let negative = self
+            .strips
+            .iter()
+            .map(|strip| strip.negative(NEGATIVE_SHARE * mean.abs(), NEGATIVE_SIGNIFICANCE));
         let negative_area = negative.sum::<f64>() / measured;
         // Masks with a constant sum leave no structure of a still scene, only noise.
         let balanced = fit.as_ref().is_some_and(|fit| fit.balance < MIN_BALANCE);
@@ -404,6 +411,7 @@ impl MeasurementStudy {
             shift: (pixels_from_centre(row), pixels_from_centre(column)),
             explained: explained_shifted,
             explained_unshifted: unshifted,
+            expected: mean.powi(2) * fit.structure / self.energy,
             shift_significance: gain * self.pixels
                 / (1.0 - explained_shifted).max(1e-3)
                 / self.frames as f64,
@@ -579,6 +587,9 @@ fn local_phase_difference(strips: &[Strip], brightness: &Array1<f64>) -> PhaseDi
 /// The largest phase difference that the masks do not explain. The standard error comes from the scatter between
 /// strips: a mosaic has the same sign everywhere, whereas the texture of a scene changes sign.
 fn phase_difference(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> PhaseDifference {
+    if strips.len() < MIN_STRIPS {
+        return PhaseDifference::default();
+    }
     let count = strips.len() as f64;
     let measured: Vec<f64> = strips.iter().map(|strip| strip.measured.sum()).collect();
     let total: f64 = measured.iter().sum();
@@ -608,7 +619,7 @@ fn phase_difference(strips: &[Strip], brightness: &Array1<f64>, mean: f64) -> Ph
             .iter()
             .map(|(residual, weight)| ((residual - average) * **weight).powi(2))
             .sum::<f64>();
-        let error = (scatter * count / (count - 1.0).max(1.0)).sqrt() / total;
+        let error = (scatter * count / (count - 1.0)).sqrt() / total;
         PhaseDifference { amplitude: average.abs(), significance: average.abs() / error.max(1e-9) }
     };
     let differences = (0..4).map(difference);
@@ -893,7 +904,17 @@ fn inverted_masks(figures: &MeasurementFigures) -> Option<Finding> {
 
 /// Masks that explain next to nothing of the measurement.
 fn foreign_masks(figures: &MeasurementFigures) -> Option<Finding> {
-    (figures.explained_unshifted < MIN_EXPLAINED).then(|| {
+    let (explained, expected) = (figures.explained_unshifted, figures.expected);
+    if explained < MIN_EXPLAINED && expected < ENOUGH_EXPECTED && !figures.is_flat {
+        let detail = format!(
+            "the masks explain {:.1} % of the fine structure of the measurement, and the right masks would explain about \
+             {:.1} %: the noise, or the texture of the scene, is much stronger than the pattern of the masks",
+            100.0 * explained.max(0.0),
+            100.0 * expected
+        );
+        return Some(Finding::new(FindingCode::UnverifiedMasks, detail));
+    }
+    (explained < MIN_EXPLAINED).then(|| {
         let detail = if figures.is_flat {
             "all pixels of the snapshot have nearly the same value, so no mask is visible in it".to_owned()
         } else {
@@ -1417,6 +1438,51 @@ mod tests {
         let mut study = MeasurementStudy::new(8);
         study.add(masks.view(), flat(0.0).view(), (0, 0));
         assert_eq!(study.finish(), None);
+    }
+
+    /// Objects on black, with as much noise as light.
+    #[test]
+    fn noise_of_a_dark_scene_is_not_negative() {
+        let masks = fine_masks(8, 136);
+        let y = measure(masks.view(), cells(8, 136).view()).unwrap();
+        for noise in [0.2, 0.4] {
+            let y = noisy(y.clone(), noise, 1).unwrap();
+            let found = codes_without_dark(&masks, &y);
+            assert!(!found.contains(&"negative"), "{noise}: {found:?}");
+            let lowered = codes_without_dark(&masks, &(&y - 0.3));
+            assert!(lowered.contains(&"negative"), "{noise}: {lowered:?}");
+        }
+    }
+
+    /// A strip of 8 rows has no scatter.
+    #[test]
+    fn low_pictures_are_no_mosaic() {
+        for (seed, rows) in (0..40).zip([16, 20, 23, 24, 31].into_iter().cycle()) {
+            let masks = crate::iid_masks(4, rows, 120, seed).unwrap();
+            let scene = Array3::from_shape_fn((4, rows, 120), |(k, i, j)| {
+                0.5 + 0.4
+                    * ((seed as f32 + i as f32 * 0.4 + k as f32).sin() * (j as f32 * 0.3).cos())
+            });
+            let y = noisy(measure(masks.view(), scene.view()).unwrap(), 0.02, seed).unwrap();
+            let found = codes_without_dark(&masks, &y);
+            let is_false = |code: &&str| ["mosaic", "no_dark", "negative_offset"].contains(code);
+            assert!(!found.iter().any(is_false), "{rows} rows, seed {seed}: {found:?}");
+        }
+    }
+
+    /// Masks of low contrast behind strong noise can't be told from others.
+    #[test]
+    fn masks_that_noise_hides_are_not_foreign() {
+        let weak = |masks: Array3<f32>| 0.6 + 0.4 * masks;
+        let other = crate::iid_masks(8, 136, 136, 5).unwrap();
+        let (masks, other) = (weak(fine_masks(8, 136)), weak(other));
+        let y = measure(masks.view(), scene(8, 136).view()).unwrap();
+        for (noise, expected) in [(0.0, "foreign_masks"), (2.0, "unverified_masks")] {
+            let y = noisy(y.clone(), noise, 3).unwrap();
+            assert_eq!(codes(&other, &y), [expected], "other masks, noise {noise}");
+            let right = codes(&masks, &y);
+            assert_eq!(right.contains(&"unverified_masks"), noise > 0.0, "{right:?}");
+        }
     }
 
     #[test]

@@ -12,6 +12,8 @@ pub(super) const BLOCK: usize = 8;
 const WEIGHT_REGULARISATION: f64 = 0.1;
 /// Blocks with a smaller share of measured pixels are left out.
 const MIN_MEASURED: f64 = 0.25;
+/// Fewer strips have no scatter that shows a standard error.
+pub(super) const MIN_STRIPS: usize = 3;
 /// Number of blocks that are fitted each for itself.
 const MOST_BLOCKS: usize = 4096;
 /// Those with a smaller share of the mean energy are left out: they are dark.
@@ -58,6 +60,8 @@ pub(super) struct Fit {
     /// Energy of the sum of the masks' fine structure relative to the sum of their energies: 1 for independent masks, 0 for
     /// masks with a constant sum.
     pub(super) balance: f64,
+    /// `sum S'^2` over the pixels, S the sum of the masks relative to its mean: the energy of a uniform scene with a mean of 1.
+    pub(super) structure: f64,
 }
 
 impl Fit {
@@ -89,9 +93,23 @@ impl Fit {
         };
         let scatter = sums.iter().map(|strip| influence(strip).powi(2)).sum::<f64>();
         let count = sums.len() as f64;
-        let offset_uncertainty = (scatter * count / (count - 1.0).max(1.0)).sqrt();
+        let offset_uncertainty = if sums.len() < MIN_STRIPS {
+            f64::INFINITY
+        } else {
+            (scatter * count / (count - 1.0)).sqrt()
+        };
         let balance = products.sum() / products.diag().sum().max(f64::MIN_POSITIVE);
-        Some(Self { inverse, brightness, explained, offset, offset_uncertainty, balance })
+        let light = (mask_sums.sum() / total).max(f64::MIN_POSITIVE);
+        let structure = products.sum() / light.powi(2);
+        Some(Self {
+            inverse,
+            brightness,
+            explained,
+            offset,
+            offset_uncertainty,
+            balance,
+            structure,
+        })
     }
 }
 
@@ -329,6 +347,20 @@ impl Strip {
             products: masks.dot(&masks.t()).mapv(f64::from),
             correlations: masks.dot(&y).mapv(f64::from),
         }
+    }
+
+    /// Number of blocks whose mean is below 0 by more than `least` and by more than noise explains.
+    pub(super) fn negative(&self, least: f64, standard_errors: f64) -> f64 {
+        let mut squares = Array1::<f64>::zeros(self.y_means.len());
+        for (block, y) in self.blocks().zip(&self.y) {
+            squares[block] += f64::from(*y).powi(2);
+        }
+        let is_negative = |block: &usize| {
+            let pixels = self.pixels(*block);
+            let error = (squares[*block] / pixels / pixels).sqrt();
+            self.y_means[*block] < -least.max(standard_errors * error)
+        };
+        (0..self.y_means.len()).filter(is_negative).map(|block| self.measured[block]).sum()
     }
 
     /// Residual `y' - sum_k x_k C_k'` \[64n\].

@@ -287,7 +287,7 @@ fn exchanged_masks(orders: &[Order]) -> Option<Finding> {
     let detail = format!(
         "the frames would follow one another more steadily if frames {first} and {second} (counted from 0) were \
          exchanged. Most likely the masks are in a wrong order or one is missing: count them first. A scene that moves \
-         to and fro looks the same"
+         to and fro, and light that flickers from frame to frame, look the same"
     );
     let finding = Finding::new(FindingCode::ExchangedMasks, detail);
     Some(Finding { frames: vec![first, second], ..finding })
