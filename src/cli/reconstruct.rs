@@ -39,7 +39,7 @@ use engine::pipeline::pilot::full_schedule;
 use engine::pipeline::quality::{FrameQuality, Quality};
 use engine::pipeline::records::{CostRecord, PilotRecord, RunRecord, TileRecord, changes};
 use engine::pipeline::registration;
-use engine::pipeline::scale::{Histogram, white, white_level};
+use engine::pipeline::scale::{Histogram, lit, white, white_level};
 use engine::pipeline::sequence::{SequenceInput, Solved, Solver, solve};
 use engine::pipeline::usage::{cpu_seconds, peak_rss_bytes};
 use engine::pipeline::write::{OnDisk, check_output, replace_result, write_result};
@@ -178,6 +178,7 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let setup = Setup { algorithm, schedule, plan, runs, network, model, threads };
 
     let (started, before) = (Instant::now(), cpu_seconds());
+    let lit = lit(input.light(None)?.view());
     let white = input.register(arguments.registration)?;
     let solver = match &setup.model {
         Some(model) => Solver::Network(&model.file),
@@ -214,10 +215,11 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     let solved_frame =
         |index| solved.frame(&sequence, input.first + index / frames, index % frames);
     let dispersion = input.sources.masks.dispersion.as_ref();
-    let frame = |index| match dispersion {
-        Some(bands) => bands.unshear(solved_frame(index).view(), index % frames),
-        None => solved_frame(index),
+    let in_place = |index: usize, solved: Array2<f32>| match dispersion {
+        Some(bands) => bands.unshear(solved.view(), index % frames),
+        None => solved,
     };
+    let frame = |index| in_place(index, solved_frame(index));
     let compare = |(truth, channels): &(Array3<f32>, Channels)| {
         let frame = |index| match (arguments.mosaic, channels) {
             (Some(mosaic), Channels::Rgb) => mosaic.demosaick(solved_frame(index).view(), (0, 0)),
@@ -227,7 +229,9 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     };
     let quality = input.truth.as_ref().map(compare).transpose()?;
     let mut histogram = Histogram::default();
-    (0..frames * snapshots.len()).for_each(|index| histogram.add(&frame(index)));
+    (0..frames * snapshots.len()).for_each(|index| {
+        histogram.add(frame(index).view(), in_place(index, lit.clone()).view());
+    });
     let white_level = white_level(&histogram, white);
     let recipe = input.recipe(&setup, white, white_level, &solved, arguments)?;
     let expected = |snapshot| {

@@ -7,6 +7,12 @@ use super::error::{ReconError, Result, check_parameter, check_shape, shape_text}
 /// Share of the pixels that lie at or below the white level.
 const WHITE_QUANTILE: f64 = 0.995;
 
+/// Light below which pixels do not count for a white level: a quarter of the mean of `light` \[H,W\], the sum of the masks. In
+/// less light the noise is too strong.
+pub fn least_light(light: ArrayView2<'_, f32>) -> f32 {
+    0.25 * light.mean().unwrap_or(0.0)
+}
+
 /// Estimates the white level of a scene from its masks and one measurement.
 ///
 /// At each pixel `y / sum_k C_k` is a mean of the frames, weighted by the masks. The white level is its upper
@@ -31,9 +37,8 @@ impl ScaleEstimator {
     pub fn white(&self, y: ArrayView2<'_, f32>) -> Result<f32> {
         let (found, expected) = (shape_text(y.shape()), shape_text(self.light.shape()));
         check_shape(y.dim() == self.light.dim(), "the measurement", found, expected)?;
-        // Pixels with little light have a ratio of noise to almost nothing.
-        let floor = 0.25 * self.light.mean().unwrap_or(0.0);
-        let is_lit = |&(y, light): &(&f32, &f32)| *light > floor && !y.is_nan();
+        let least = least_light(self.light.view());
+        let is_lit = |&(y, light): &(&f32, &f32)| *light > least && !y.is_nan();
         let lit = y.iter().zip(&self.light).filter(is_lit);
         let mut ratios: Vec<f32> = lit.map(|(&y, &light)| y / light).collect();
         if ratios.is_empty() {

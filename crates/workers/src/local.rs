@@ -118,6 +118,8 @@ impl Local {
                 TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
             }
             TaskKind::White => TaskInput::White {
+                // As the command without a service, which moves the masks in place.
+                arrays: Arrays { correction: None, ..arrays },
                 recipe: Box::new(recipe(task)?),
                 snapshots: spec.snapshots,
                 tiles: self.stored_tiles(&task.tiles)?,

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ndarray::Array3;
+use ndarray::{Array2, Array3};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -88,8 +88,9 @@ pub(super) fn perform(
                 with_room(engines, |engines| tile(transport, &task, engines, monitor))?;
             (json(&record)?, Output::Stack(frames))
         }
-        TaskInput::White { recipe, snapshots, tiles } => {
-            let white_level = white_level(&recipe, snapshots, &tiles, monitor)?;
+        TaskInput::White { arrays, recipe, snapshots, tiles } => {
+            let lit = scale::lit(arrays.light(monitor)?.view());
+            let white_level = white_level(&recipe, (snapshots, &tiles), &lit, monitor)?;
             monitor.reach(TaskStage::Reading, 1.0);
             (json(&WhiteRecord { white_level })?, Output::Record)
         }
@@ -234,11 +235,11 @@ fn run_pilot(
     Ok(pilot::decide(input, task, networks, &mut monitor.observe(task.schedule.clone()))?)
 }
 
-/// The white level of all frames of a job. All tiles must be there.
+/// The white level of all frames of a job where they are `lit` \[H,W\]. All tiles must be there.
 fn white_level(
     recipe: &Recipe,
-    snapshots: SnapshotRange,
-    tiles: &[StoredTile],
+    (snapshots, tiles): (SnapshotRange, &[StoredTile]),
+    lit: &Array2<f32>,
     monitor: &Monitor,
 ) -> Result<f32, PipelineError> {
     let mut histogram = Histogram::default();
@@ -258,7 +259,7 @@ fn white_level(
         for k in 0..recipe.shape.frames {
             monitor.check()?;
             let frame = blend::stored_frame(&recipe.tile_plan, &shares, k)?;
-            histogram.add(&recipe.frame(k, frame));
+            histogram.add(recipe.frame(k, frame).view(), recipe.frame(k, lit.clone()).view());
         }
         monitor.reach(TaskStage::Reading, (index + 1) as f64 / f64::from(snapshots.count));
     }

@@ -139,6 +139,7 @@ pub enum TaskInput {
     Tile(Box<TileTask>),
     /// Determine the white level of all frames of a job from all its tiles.
     White {
+        arrays: Arrays,
         recipe: Box<Recipe>,
         snapshots: SnapshotRange,
         tiles: Vec<StoredTile>,

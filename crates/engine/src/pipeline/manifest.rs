@@ -273,8 +273,8 @@ pub struct ScaleRecord {
     pub measurement_full_scale: f32,
     /// Brightness that the solver takes for 1, estimated once per job from the measurement.
     pub normalisation: f32,
-    /// The 99.9th percentile of all frames of the job: the peak of the expected PSNR, and the value that pictures show
-    /// as white.
+    /// The 99.9th percentile of all frames of the job, without pixels that get less than a quarter of the mean light: the
+    /// peak of the expected PSNR, and the value that pictures show as white.
     pub white_level: f32,
 }
 

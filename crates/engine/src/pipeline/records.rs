@@ -24,7 +24,7 @@ pub struct PreparedRecord {
 /// The record of the task that determines the white level of a job.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct WhiteRecord {
-    /// The 99.9th percentile of all frames.
+    /// The 99.9th percentile of all frames, without dim pixels.
     pub white_level: f32,
 }
 

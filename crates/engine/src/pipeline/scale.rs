@@ -1,6 +1,6 @@
 //! The two scales of a job: that of the solver, which all tiles share, and the white level of the frames, for people.
 
-use ndarray::{Array2, ArrayView3};
+use ndarray::{Array2, ArrayView2, ArrayView3};
 
 use super::arrays::Arrays;
 use super::error::{PipelineError, Result};
@@ -8,7 +8,7 @@ use super::progress::Monitor;
 use crate::job::SnapshotRange;
 use reconstruction::ReconError;
 use reconstruction::error::check_shape;
-use reconstruction::scale::ScaleEstimator;
+use reconstruction::scale::{ScaleEstimator, least_light};
 
 /// The solver's scale for snapshots \[S,H,W\] in memory. `light` \[H,W\] is that of their masks.
 ///
@@ -73,6 +73,13 @@ const WHITE_QUANTILE: f64 = 0.999;
 /// Bits of a sample that select its bin: the exponent and 11 bits of the mantissa, a bin width of 0.05 %.
 const BIN_BITS: u32 = 19;
 
+/// 1 for the pixels that count for the white level, and 0 for those whose masks, with the sum `light` \[H,W\], pass too
+/// little light. The map of a spectral camera is moved and interpolated as its frames are.
+pub fn lit(light: ArrayView2<'_, f32>) -> Array2<f32> {
+    let least = least_light(light);
+    light.mapv(|light| f32::from(u8::from(light > least)))
+}
+
 /// Histogram of the samples of frames, from which their white level follows.
 ///
 /// The order of the samples does not matter, so the white level is the same for all cuts into tasks.
@@ -91,9 +98,10 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Adds the finite ones of some samples.
-    pub fn add<'a>(&mut self, samples: impl IntoIterator<Item = &'a f32>) {
-        for sample in samples.into_iter().filter(|sample| sample.is_finite()) {
+    /// Adds the finite samples of a frame \[H,W\] where it is [lit].
+    pub fn add(&mut self, frame: ArrayView2<'_, f32>, lit: ArrayView2<'_, f32>) {
+        let is_lit = |(sample, lit): &(&f32, &f32)| sample.is_finite() && **lit > 0.999;
+        for (sample, _) in frame.iter().zip(&lit).filter(is_lit) {
             self.total += 1;
             if *sample > 0.0 {
                 self.counts[(sample.to_bits() >> (31 - BIN_BITS)) as usize] += 1;
@@ -123,7 +131,15 @@ pub fn white_level(histogram: &Histogram, solver_white: f32) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use super::{Histogram, median_white};
+    use super::{Histogram, lit, median_white};
+    use ndarray::{Array2, ArrayView2};
+
+    /// Samples as a row of lit pixels.
+    fn add(histogram: &mut Histogram, samples: &[f32]) {
+        let lit = Array2::ones((1, samples.len()));
+        let row = ArrayView2::from_shape((1, samples.len()), samples).unwrap();
+        histogram.add(row, lit.view());
+    }
 
     #[test]
     fn white_levels_do_not_depend_on_order_and_unit() {
@@ -131,8 +147,8 @@ mod tests {
         let white = |scale: f32| {
             let (mut whole, mut parts) = (Histogram::default(), Histogram::default());
             let scaled: Vec<f32> = samples.iter().map(|sample| sample * scale).collect();
-            whole.add(&scaled);
-            scaled.chunks(77).rev().for_each(|part| parts.add(part));
+            add(&mut whole, &scaled);
+            scaled.chunks(77).rev().for_each(|part| add(&mut parts, part));
             assert_eq!(whole.white_level(), parts.white_level());
             whole.white_level().unwrap()
         };
@@ -141,8 +157,21 @@ mod tests {
             assert!((level - 0.999).abs() < 1e-3, "{scale}: {level}");
         }
         let mut dark = Histogram::default();
-        dark.add(&[0.0, -1.0, f32::NAN]);
+        add(&mut dark, &[0.0, -1.0, f32::NAN]);
         assert_eq!(dark.white_level(), None);
+    }
+
+    #[test]
+    fn noise_in_dim_corners_does_not_set_the_white_level() {
+        let mut light = Array2::from_elem((100, 100), 4.0);
+        let mut frame = Array2::from_elem((100, 100), 0.8);
+        for row in 0..10 {
+            light[[row, 0]] = 0.5;
+            frame[[row, 0]] = 7.0;
+        }
+        let mut histogram = Histogram::default();
+        histogram.add(frame.view(), lit(light.view()).view());
+        assert!((histogram.white_level().unwrap() - 0.8).abs() < 1e-3, "{histogram:?}");
     }
 
     #[test]
