@@ -414,8 +414,8 @@ const AREA: usize = 16;
 /// Smallest share of a picture without an open mask that is reported.
 const MIN_CLOSED: f64 = 0.002;
 
-/// A pixel is closed if the most open of its masks passes this share of what that of other pixels passes. From less light
-/// the solver would amplify the noise more than twenty times.
+/// A pixel is closed if its largest mask value is at most this share of the mean over all pixels. The solver would amplify its
+/// noise twenty times and more.
 const MIN_OPEN: f32 = 0.05;
 
 /// True for pixels without an open mask. `largest` \[H,W\] is the largest value of the masks at each pixel, NaN where they

@@ -139,7 +139,7 @@ pub struct MeasurementFigures {
     pub explained: f64,
     /// Share of the measurement's fine structure that the masks explain without a shift.
     pub explained_unshifted: f64,
-    /// Share of the fine structure that the right masks of a uniform scene explain; less than 1 with noise and texture.
+    /// Share of the fine structure that the right masks explain if the scene is uniform apart from texture and noise.
     pub expected: f64,
     /// Gain of the shift, as a multiple of the gain expected from chance for the brightness of one frame.
     pub shift_significance: f64,
@@ -1470,7 +1470,7 @@ mod tests {
         }
     }
 
-    /// Masks of low contrast behind strong noise can't be told from others.
+    /// Strong noise hides masks of low contrast.
     #[test]
     fn masks_that_noise_hides_are_not_foreign() {
         let weak = |masks: Array3<f32>| 0.6 + 0.4 * masks;

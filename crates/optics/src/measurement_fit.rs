@@ -12,7 +12,7 @@ pub(super) const BLOCK: usize = 8;
 const WEIGHT_REGULARISATION: f64 = 0.1;
 /// Blocks with a smaller share of measured pixels are left out.
 const MIN_MEASURED: f64 = 0.25;
-/// Fewer strips have no scatter that shows a standard error.
+/// Number of strips from which on their scatter gives a standard error.
 pub(super) const MIN_STRIPS: usize = 3;
 /// Number of blocks that are fitted each for itself.
 const MOST_BLOCKS: usize = 4096;

@@ -118,7 +118,7 @@ impl Local {
                 TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
             }
             TaskKind::White => TaskInput::White {
-                // As the command without a service, which moves the masks in place.
+                // The command without a service has these masks alone when it looks for dim pixels.
                 arrays: Arrays { correction: None, ..arrays },
                 recipe: Box::new(recipe(task)?),
                 snapshots: spec.snapshots,

@@ -209,7 +209,7 @@ mod tests {
         y.slice_mut(s![.., ..16, ..16]).fill(f32::NAN);
         y.slice_mut(s![.., ..16, 16..32]).fill(0.0);
         y.slice_mut(s![.., 16.., 32..]).fill(f32::NAN);
-        // Where the masks leak a little, the intake marks the pixels.
+        // The intake marks pixels whose masks leak a little.
         masks.slice_mut(s![.., 16.., ..16]).fill(0.01);
         y.slice_mut(s![.., 16.., ..16]).fill(f32::NAN);
         for pieces in [vec![0..2], vec![0..1, 1..2]] {
