@@ -156,7 +156,11 @@ pub fn run(arguments: &Arguments) -> Result<()> {
     }
     let mut input = Input::read(arguments)?;
     let folders = folders(arguments.out.as_deref(), &input.snapshots());
-    folders.iter().try_for_each(|(_, folder)| check_output(folder))?;
+    for (_, folder) in &folders {
+        check_output(folder)?;
+        // A folder that can't be written to ends the command before the work.
+        draft(folder)?;
+    }
     let algorithm = arguments.schedule.algorithm();
     let model = model(arguments, &network)?;
     let snapshots = input.snapshots();
@@ -587,12 +591,17 @@ fn write(
     error: Option<ArrayView3<'_, f32>>,
     frame: impl Fn(usize) -> Array2<f32>,
 ) -> Result<()> {
-    let failed = |error| CliError::file("write", out, &error);
-    fs::create_dir_all(out).map_err(failed)?;
     // If writing fails, an earlier result remains.
-    let draft = tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)?;
+    let draft = draft(out)?;
     write_result(draft.path(), manifest, error, OnDisk::All, |k| Ok(frame(k)))?;
     Ok(replace_result(draft.path(), out)?)
+}
+
+/// A folder in `out` for a result that is not complete; it creates `out`.
+fn draft(out: &Path) -> Result<tempfile::TempDir> {
+    let failed = |error| CliError::file("write", out, &error);
+    fs::create_dir_all(out).map_err(failed)?;
+    tempfile::Builder::new().prefix(".making-").tempdir_in(out).map_err(failed)
 }
 
 /// The object that `--json` prints.

@@ -275,6 +275,11 @@ fn mismatched_inputs_are_rejected_with_the_reason() {
     std::fs::create_dir_all(files.path("mine/frames")).unwrap();
     let foreign = run(&masks, &["--measurement", &measurement, "--out", &files.text("mine")]);
     assert!(foreign.contains("frames"), "{foreign}");
+    // The output is tried before the model is read, and so before the work.
+    let out = ["--measurement", &measurement, "--model", "/nowhere/m.onnx", "--out", &small];
+    let late =
+        rejection(&[&base[..1], &["--algorithm", "learned", "--masks", &masks], &out].concat());
+    assert!(late.contains("cannot write") && late.contains("small.npy"), "{late}");
     let few = rejection(&[
         "simulate",
         "--frames",

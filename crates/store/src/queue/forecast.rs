@@ -91,8 +91,8 @@ pub struct Left {
 /// The load that is served before a job.
 #[derive(Debug, Clone, Copy)]
 struct Ahead {
-    /// Planned CPU-seconds.
-    cost: f64,
+    /// Seconds that all workers need for it.
+    seconds: f64,
     /// The job's place among those that wait, from 1.
     position: usize,
 }
@@ -104,8 +104,10 @@ pub(super) struct Unfinished {
     pub(super) lab: usize,
     pub(super) priority: i64,
     pub(super) waits: bool,
-    /// Planned CPU-seconds that are left of it.
-    pub(super) left: f64,
+    /// Planned CPU-seconds that are left of its tiles and pilot.
+    pub(super) tiles: f64,
+    /// Planned CPU-seconds that are left of its other tasks.
+    pub(super) others: f64,
 }
 
 impl Forecast {
@@ -121,7 +123,7 @@ impl Forecast {
         if self.tiles.workers == 0 || self.others.workers == 0 {
             return None;
         }
-        let ahead = self.ahead(job).cost / self.tiles.speed;
+        let ahead = self.ahead(job).seconds;
         let tiles = self.tiles.seconds(tiles, own_rate.unwrap_or(self.tiles.rate()));
         let others = self.others.seconds(others, self.others.rate());
         Some(ahead + tiles.sum + others.sum + tiles.longest.max(others.longest))
@@ -147,16 +149,22 @@ impl Forecast {
         let shares: Vec<f64> = labs.iter().map(|(_, share)| *share).collect();
         let mut left = vec![0.0; labs.len()];
         for job in unfinished {
-            left[job.lab] += job.left;
+            left[job.lab] += job.tiles + job.others;
         }
+        // Without workers the order alone matters.
+        let speed = |crew: Crew| if crew.workers == 0 { 1.0 } else { crew.speed };
+        let seconds: Vec<f64> = unfinished
+            .iter()
+            .map(|job| job.tiles / speed(tiles) + job.others / speed(others))
+            .collect();
         let new_job = Ahead {
-            cost: unfinished.iter().map(|job| job.left).sum(),
+            seconds: seconds.iter().sum(),
             position: 1 + unfinished.iter().filter(|job| job.waits).count(),
         };
         Self {
             tiles,
             others,
-            jobs: ahead(unfinished, &shares),
+            jobs: ahead(unfinished, &seconds, &shares),
             new_job,
             left_by_lab: labs.into_iter().map(|(lab, _)| lab).zip(left).collect(),
             until: Instant::now() + (KEPT_PER_JOB * count(unfinished.len())).min(KEPT_AT_MOST),
@@ -186,38 +194,40 @@ fn count(things: usize) -> u32 {
     u32::try_from(things).unwrap_or(u32::MAX)
 }
 
-/// The load ahead of each of these jobs, which are in the order of their submission. `shares` are those of the labs.
-fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
-    let mut by_priority: BTreeMap<i64, Vec<&Unfinished>> = BTreeMap::new();
-    for job in jobs {
-        by_priority.entry(job.priority).or_default().push(job);
+/// The load ahead of each of these jobs, which are in the order of their submission. `seconds` are left of each job, and
+/// `shares` are those of the labs.
+fn ahead(jobs: &[Unfinished], seconds: &[f64], shares: &[f64]) -> HashMap<JobId, Ahead> {
+    let mut by_priority: BTreeMap<i64, Vec<(&Unfinished, f64)>> = BTreeMap::new();
+    for (job, left) in jobs.iter().zip(seconds) {
+        by_priority.entry(job.priority).or_default().push((job, *left));
     }
     let (mut above, mut found) = (0.0, Vec::with_capacity(jobs.len()));
     for jobs in by_priority.into_values().rev() {
         let mut wanted = vec![0.0; shares.len()];
-        for job in &jobs {
-            wanted[job.lab] += job.left;
+        for (job, left) in &jobs {
+            wanted[job.lab] += left;
         }
         let mut earlier = vec![0.0; shares.len()];
-        for job in jobs {
-            let served = earlier[job.lab] + job.left;
+        for (job, left) in jobs {
+            let served = earlier[job.lab] + left;
             let others: f64 = (0..shares.len())
                 .filter(|lab| *lab != job.lab)
                 .map(|lab| wanted[lab].min(served * shares[lab] / shares[job.lab]))
                 .sum();
-            found.push((job, above + earlier[job.lab] + others));
+            let before = above + earlier[job.lab] + others;
+            found.push((job, before, before + left));
             earlier[job.lab] = served;
         }
         above += wanted.iter().sum::<f64>();
     }
     // The job that ends first is served first; of two equal jobs, the older one.
-    found.sort_by(|(a, before_a), (b, before_b)| {
-        b.priority.cmp(&a.priority).then((before_a + a.left).total_cmp(&(before_b + b.left)))
+    found.sort_by(|(a, _, end_a), (b, _, end_b)| {
+        b.priority.cmp(&a.priority).then(end_a.total_cmp(end_b))
     });
     let mut position = 1;
     let mut placed = HashMap::with_capacity(found.len());
-    for (job, cost) in found {
-        placed.insert(job.id, Ahead { cost, position });
+    for (job, seconds, _) in found {
+        placed.insert(job.id, Ahead { seconds, position });
         position += usize::from(job.waits);
     }
     placed
@@ -225,22 +235,21 @@ fn ahead(jobs: &[Unfinished], shares: &[f64]) -> HashMap<JobId, Ahead> {
 
 #[cfg(test)]
 mod tests {
-    use super::{Ahead, JobId, Unfinished, ahead};
+    use super::{Ahead, Crew, Forecast, JobId, Left, Unfinished, ahead};
+
+    fn unfinished(lab: usize, priority: i64, (tiles, others): (f64, f64)) -> Unfinished {
+        Unfinished { id: JobId::new(), lab, priority, waits: true, tiles, others }
+    }
 
     /// Planned seconds ahead of each job and its place, from its lab, its priority and the seconds left of it.
     fn served(jobs: &[(usize, i64, f64)], shares: &[f64]) -> Vec<(f64, usize)> {
+        let seconds: Vec<_> = jobs.iter().map(|(.., left)| *left).collect();
         let jobs: Vec<_> = jobs
             .iter()
-            .map(|&(lab, priority, left)| Unfinished {
-                id: JobId::new(),
-                lab,
-                priority,
-                waits: true,
-                left,
-            })
+            .map(|&(lab, priority, left)| unfinished(lab, priority, (left, 0.0)))
             .collect();
-        let found = ahead(&jobs, shares);
-        let figures = |Ahead { cost, position }| (cost, position);
+        let found = ahead(&jobs, &seconds, shares);
+        let figures = |Ahead { seconds, position }| (seconds, position);
         jobs.iter().map(|job| figures(found[&job.id])).collect()
     }
 
@@ -248,6 +257,21 @@ mod tests {
     fn jobs_of_one_lab_wait_for_older_and_for_urgent_jobs() {
         let jobs = [(0, 0, 10.0), (0, 0, 20.0), (0, 5, 3.0)];
         assert_eq!(served(&jobs, &[1.0]), [(3.0, 2), (13.0, 3), (0.0, 1)]);
+    }
+
+    /// Workers do a planned second of other tasks ten times slower than one of tiles.
+    #[test]
+    fn a_later_job_does_not_end_earlier() {
+        let jobs = [unfinished(0, 0, (10.0, 10.0)), unfinished(0, 0, (10.0, 0.0))];
+        let crew = |speed| Crew { workers: 1, speed };
+        let labs = vec![("optics".parse().unwrap(), 1.0)];
+        let forecast = Forecast::new(&jobs, labs, crew(10.0), crew(1.0));
+        let left = |sum| Left { sum, longest: 0.0 };
+        let end = |job: &Unfinished| {
+            forecast.eta_seconds(job.id, (left(job.tiles), left(job.others)), None).unwrap()
+        };
+        assert_eq!((end(&jobs[0]), end(&jobs[1])), (11.0, 12.0));
+        assert_eq!(jobs.each_ref().map(|job| forecast.position(job.id)), [1, 2]);
     }
 
     #[test]

@@ -48,7 +48,7 @@ impl Store {
 
     async fn new_forecast(&self) -> Result<Forecast> {
         let rows = sql!(
-            "SELECT id, lab, priority, state, tiles_left + others_left AS left
+            "SELECT id, lab, priority, state, tiles_left, others_left
              FROM jobs INDEXED BY jobs_unfinished JOIN job_sums ON job = id
              WHERE finished_at IS NULL ORDER BY id",
         )
@@ -70,7 +70,8 @@ impl Store {
                 lab: place,
                 priority: row.read("priority")?,
                 waits: row.read::<JobState>("state")? == JobState::Queued,
-                left: row.read("left")?,
+                tiles: row.read("tiles_left")?,
+                others: row.read("others_left")?,
             });
         }
         let (tiles, others) = (self.crew(true).await?, self.crew(false).await?);
