@@ -140,6 +140,7 @@ async fn delete_all(
         let text = format!("jobs that are {state} can't be deleted: cancel them first");
         return Err(CliError::Input(text));
     }
+    store.lab(lab.as_str()).await?;
     let mut filter = JobFilter { states: Some(states.to_vec()), ..JobFilter::default() };
     let mut count = 0_u64;
     loop {

@@ -144,6 +144,8 @@ async fn the_command_line_sees_and_changes_all_labs() {
     let (_, text) = command(&[&all[..], &["--state", "failed", "--yes"]].concat());
     assert!(text.contains("deleted 0 jobs of a (failed)"), "{text}");
     assert!(command(&[&all[..], &["--yes"]].concat()).1.contains("deleted 2 jobs of a"));
+    let (code, text) = command(&["job", "delete", "--all", "--lab", "nope", "--yes"]);
+    assert!(code == 2 && text.contains("nope"), "{text}");
     app.get(&format!("/v1/jobs/{}", jobs[0])).await.problem(404, "not_found");
     app.get(&format!("/v1/jobs/{}", jobs[2])).await.expect(200);
     command(&["job", "cancel", &jobs[2]]);

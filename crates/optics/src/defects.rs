@@ -66,7 +66,8 @@ const TOO_DARK: f32 = 0.05;
 /// Smallest deviations of outliers, as shares of the 99th percentile of the snapshot.
 const MIN_EXCESS: f32 = 0.1;
 const MIN_DEFICIT: f32 = 0.25;
-/// Masks must pass this share of the mean light to compare the brightness of neighbours, and to call a pixel dark.
+/// Masks must pass this share of the mean light, or of that of a dim pixel, to compare the brightness of neighbours, and to
+/// call a pixel dark.
 const ENOUGH_LIGHT: f32 = 0.25;
 const MUCH_LIGHT: f32 = 0.75;
 
@@ -108,6 +109,8 @@ pub fn outliers(
         if !value.is_finite() || !(value > excess || may_be_dark) {
             return false;
         }
+        let is_dim = own < ENOUGH_LIGHT * mean_light;
+        let enough = ENOUGH_LIGHT * if is_dim { own } else { mean_light };
         let (mut values, mut ratios) = ([f32::NEG_INFINITY; FEW + 1], [f32::NEG_INFINITY; FEW + 1]);
         let mut darkest = [f32::INFINITY; FEW];
         for row_near in neighbours(row, height) {
@@ -117,7 +120,7 @@ pub fn outliers(
                     continue;
                 }
                 insert(&mut values, near, |new, old| new > old);
-                if light > ENOUGH_LIGHT * mean_light {
+                if light > enough {
                     insert(&mut ratios, near / light, |new, old| new > old);
                     insert(&mut darkest, near / light, |new, old| new < old);
                 }

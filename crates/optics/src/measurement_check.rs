@@ -19,7 +19,7 @@ use super::measurement_fit::{
     BLOCK, Fit, LocalFit, MIN_STRIPS, Strip, brightness_errors, equal_weights, reweighted,
 };
 use super::modulation::{Run, Unmodulated, unmodulated};
-use super::{Finding, FindingCode};
+use super::{Finding, FindingCode, Severity};
 
 /// Largest shift between masks and measurement that is searched, in pixels along each axis.
 pub const REACH: usize = 4;
@@ -46,6 +46,8 @@ const MIN_DRIFT_EXCESS: f64 = 0.54;
 /// unless masks resemble one another too much.
 const MIN_UNEVEN: f64 = 0.12;
 const UNEVEN_SIGNIFICANCE: f64 = 3.2;
+/// A frame has no light below this share of that of the brightest one.
+const NO_LIGHT: f64 = 0.1;
 /// Offsets below this share of the mean are not reported.
 const OFFSET_SHARE: f64 = 0.03;
 /// A block counts as negative if its mean is below 0 by more than this share of the mean of the measurement, and by more
@@ -64,6 +66,9 @@ const MIN_INVERTED: f64 = 0.05;
 /// Smallest negative brightness of all frames together, relative to the mean of the measurement. Behind inverted masks it
 /// exceeds that mean. The sum is certain even where similar masks leave single frames uncertain.
 const MIN_NEGATIVE: f64 = 0.5;
+/// A shift that explains more than all of the fine structure has masks of more energy than the fit. Masks that explain this
+/// share without it are not shifted.
+const UNSHIFTED: f64 = 0.6;
 /// Masks that explain less than this share of the fine structure show no displacement.
 const MIN_EXPLAINED: f64 = 0.02;
 /// From this expected share on, masks that explain less than [`MIN_EXPLAINED`] are others.
@@ -81,6 +86,8 @@ const COPY: f64 = 0.95;
 /// measurement. Values with single precision have that rounding error.
 const FLAT: f64 = 1e-6;
 const FLAT_BEHIND_BALANCED: f64 = 0.05;
+/// Length of the pieces into which the strips of a low picture are cut, in blocks.
+const PIECE: usize = 2;
 /// Side of the parts with a displacement each, in blocks.
 const PART: usize = 4;
 
@@ -265,27 +272,37 @@ impl MeasurementStudy {
         self.is_binary &= masks.iter().all(|mask| mask.is_nan() || *mask == 0.0 || *mask == 1.0);
         let masks = with_means(masks);
         let mut fine = Array2::zeros(y.dim());
-        let mut in_run = false;
-        for row in (0..rows).step_by(BLOCK) {
-            let place = s![.., REACH + row..REACH + row + BLOCK, REACH..REACH + columns];
-            let strip = Strip::new(masks.slice(place), y.slice(s![row..row + BLOCK, ..]));
-            if strip.measured.sum() == 0.0 {
-                in_run = false;
-                continue;
-            }
-            let at = self.strips.len();
-            match self.runs.last_mut() {
-                Some(run) if in_run => run.strips.end = at + 1,
-                _ => {
-                    let place = [first_row + REACH + row, first_column + REACH];
-                    self.runs.push(Run { strips: at..at + 1, place });
+        // Low pictures have too few whole strips for a standard error.
+        let width = if rows < MIN_STRIPS * BLOCK { PIECE * BLOCK } else { columns };
+        for first in (0..columns).step_by(width) {
+            let piece = first..columns.min(first + width);
+            let mut in_run = false;
+            for row in (0..rows).step_by(BLOCK) {
+                let place = s![
+                    ..,
+                    REACH + row..REACH + row + BLOCK,
+                    REACH + piece.start..REACH + piece.end
+                ];
+                let inside = s![row..row + BLOCK, piece.clone()];
+                let strip = Strip::new(masks.slice(place), y.slice(inside));
+                if strip.measured.sum() == 0.0 {
+                    in_run = false;
+                    continue;
                 }
+                let at = self.strips.len();
+                match self.runs.last_mut() {
+                    Some(run) if in_run => run.strips.end = at + 1,
+                    _ => {
+                        let place = [first_row + REACH + row, first_column + REACH + first];
+                        self.runs.push(Run { strips: at..at + 1, place });
+                    }
+                }
+                in_run = true;
+                let own = fine.slice_mut(inside);
+                own.into_iter().zip(&strip.y).for_each(|(fine, y)| *fine = *y);
+                self.pixels += strip.measured.sum() * (BLOCK * BLOCK) as f64;
+                self.strips.push(strip);
             }
-            in_run = true;
-            let own = fine.slice_mut(s![row..row + BLOCK, ..]);
-            own.into_iter().zip(&strip.y).for_each(|(fine, y)| *fine = *y);
-            self.pixels += strip.measured.sum() * (BLOCK * BLOCK) as f64;
-            self.strips.push(strip);
         }
         let y = fine;
         for part_rows in parts(rows) {
@@ -732,7 +749,7 @@ pub fn judge_measurement(figures: &MeasurementFigures, dark_subtracted: bool) ->
         None => {
             let not_shown = dark_frames(figures);
             findings.extend(uneven_brightness(figures, &not_shown));
-            findings.extend(missing_patterns(not_shown));
+            findings.extend(missing_patterns(figures, not_shown));
             // Stray light in a part of the picture also looks like an offset.
             findings.extend(unmodulated_area(figures));
             findings.extend(unexplained_light(figures, dark_subtracted));
@@ -806,6 +823,7 @@ fn shifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
     let significant = figures.shift != (0, 0)
         // Masks that are shifted copies of each other also explain much of a shifted measurement.
         && figures.explained > 1.03 * figures.explained_unshifted
+        && (figures.explained < 1.1 || figures.explained_unshifted < UNSHIFTED)
         && figures.shift_significance > SHIFT_SIGNIFICANCE
         && figures.explained > MIN_EXPLAINED;
     significant.then(|| {
@@ -813,7 +831,7 @@ fn shifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
         let detail = format!(
             "the masks explain {:.0} % of the fine structure of the measurement when shifted by {rows} rows and \
              {columns} columns, but only {:.0} % without a shift",
-            figures.explained * 100.0,
+            figures.explained.min(1.0) * 100.0,
             figures.explained_unshifted * 100.0
         );
         Finding::new(FindingCode::ShiftedMasks, detail)
@@ -976,15 +994,26 @@ fn uneven_brightness(figures: &MeasurementFigures, not_shown: &[usize]) -> Optio
     })
 }
 
-/// Frames without light, which indicate that their patterns were not shown.
-fn missing_patterns(frames: Vec<usize>) -> Option<Finding> {
-    if frames.is_empty() {
+/// Frames without light, which indicate that their patterns were not shown. A lamp that flickers dims frames, too.
+fn missing_patterns(figures: &MeasurementFigures, frames: Vec<usize>) -> Option<Finding> {
+    let brightest = figures.brightness.iter().copied().fold(0.0, f64::max);
+    let light = frames.iter().map(|k| figures.brightness[*k]).fold(f64::NAN, f64::max);
+    if light.is_nan() {
         return None;
     }
+    if light < NO_LIGHT * brightest {
+        let detail = format!(
+            "frames {frames:?} (counted from 0) have no light: the LCoS did not show their patterns, or the scene was dark"
+        );
+        return Some(Finding::new(FindingCode::MissingPattern, detail).with_frames(frames));
+    }
     let detail = format!(
-        "frames {frames:?} (counted from 0) have no light: the LCoS did not show their patterns, or the scene was dark"
+        "frames {frames:?} (counted from 0) have {:.0} % of the light of the brightest frame or less: the LCoS showed their \
+         patterns too briefly, or the light flickers",
+        100.0 * light / brightest
     );
-    Some(Finding::new(FindingCode::MissingPattern, detail).with_frames(frames))
+    let finding = Finding::new(FindingCode::MissingPattern, detail).with_frames(frames);
+    Some(Finding { severity: Severity::Warning, ..finding })
 }
 
 /// An offset that no mask explains, which indicates that the dark frames are missing or wrong.

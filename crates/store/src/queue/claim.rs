@@ -141,7 +141,7 @@ macro_rules! look_text {
 }
 
 /// The statement that finds the next task, marks it and counts the attempt: of the highest priority, of the
-/// lab whose turn it is, of movies before jobs, of the jobs that have begun before others, of the oldest one.
+/// lab whose turn it is, of other things before jobs, of the jobs that have begun before others, of the oldest one.
 /// Parameters: see [`take`].
 macro_rules! take_text {
     ($kinds:expr, $of_lab:literal, $by_lab:literal, $by_job:literal) => {

@@ -8,12 +8,9 @@ use crate::error::{Result, StoreError};
 use crate::tables::{labs, results, sums, tasks};
 use engine::job::{JobId, JobSpec, Lab, ResourceId, RunSpec, TaskId, TaskKind, TaskState};
 
-/// Above all others: a client waits for the check of its upload.
-const CHECK_PRIORITY: i32 = 2000;
-/// Above that of every job: people wait for calibrations before they measure.
-const CALIBRATION_PRIORITY: i32 = 1000;
-/// The priority of most jobs: movies take the turns of their lab, and precede its jobs, which take longer.
-const MOVIE_PRIORITY: i32 = 0;
+/// The priority of most jobs. Checks, calibrations and movies take the turns of their lab, and precede its jobs, which take
+/// longer.
+const THING_PRIORITY: i32 = 0;
 
 pub async fn insert(
     connection: &mut SqliteConnection,
@@ -67,11 +64,7 @@ pub async fn insert_for(
     cost: f64,
 ) -> Result<()> {
     // The ordinal is the order of the tasks of one resource.
-    let (priority, ordinal) = match kind {
-        TaskKind::Check => (CHECK_PRIORITY, 0),
-        TaskKind::Movie { .. } | TaskKind::Gif { .. } => (MOVIE_PRIORITY, 1),
-        _ => (CALIBRATION_PRIORITY, 1),
-    };
+    let ordinal = i32::from(kind != TaskKind::Check);
     sql!(
         "INSERT INTO tasks (id, thing, lab, ordinal, kind, light, snapshot, state, priority, cost)
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -84,7 +77,7 @@ pub async fn insert_for(
             kind.is_light(cost),
             kind.snapshot(),
             first_state(kind),
-            priority,
+            THING_PRIORITY,
             cost
         ]
     )

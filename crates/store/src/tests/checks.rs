@@ -36,6 +36,29 @@ impl Lab {
 }
 
 #[tokio::test]
+async fn checks_take_the_turns_of_their_lab() {
+    let lab = Lab::new().await;
+    for _ in 0..8 {
+        lab.ask("busy", None).await;
+    }
+    lab.submit(0).await;
+    let mut kinds = Vec::new();
+    for _ in 0..4 {
+        let task = lab.claim().await.unwrap();
+        kinds.push(task.kind);
+        match task.kind {
+            TaskKind::Check => {
+                let refusal = Refusal::new(RefusalCode::InvalidContent, "no light");
+                checked(&lab.store, &task, Checked::Refused(refusal)).await;
+            }
+            _ => drop(lab.work(&task).await),
+        }
+    }
+    assert!(kinds.contains(&TaskKind::Check), "{kinds:?}");
+    assert!(kinds.contains(&TaskKind::Prepare), "the job of another lab waits: {kinds:?}");
+}
+
+#[tokio::test]
 async fn the_light_worker_takes_checks_and_short_tasks_of_running_jobs() {
     let lab = Lab::new().await;
     let light = async || lab.store.claim_as(Claimant::Light, lab.worker, LEASE).await.unwrap();
@@ -47,7 +70,7 @@ async fn the_light_worker_takes_checks_and_short_tasks_of_running_jobs() {
     let Work::Check(check) = &task.work else { panic!() };
     assert_eq!(CalibrationId::from(check.request.id), asked);
     lab.store.give_back(&task.lease).await.unwrap();
-    // A check goes first with every worker.
+    // With every worker a check precedes the jobs of its lab.
     let task = lab.claim().await.unwrap();
     assert_eq!(task.kind, TaskKind::Check);
     let refusal = Refusal::new(RefusalCode::InvalidContent, "no light");
