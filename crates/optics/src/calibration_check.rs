@@ -220,7 +220,8 @@ fn uneven_patterns(figures: &MaskFigures) -> Vec<Finding> {
         let detail = format!(
             "patterns {dark:?} (counted from 0) let no light through: they were probably not shown"
         );
-        findings.push(Finding::new(FindingCode::MissingPattern, detail).with_frames(dark));
+        let finding = Finding::new(FindingCode::MissingPattern, detail).with_frames(dark);
+        findings.push(finding.escalate_if(true));
     }
     if !uneven.is_empty() {
         let detail = format!(

@@ -622,6 +622,20 @@ mod tests {
     }
 
     #[test]
+    fn hot_pixels_in_dim_corners_are_found() {
+        let at = |i: usize, j: usize| (i as f32 - 48.0).hypot(j as f32 - 48.0) / 36.0;
+        let mut masks = iid_masks(8, 96, 96, 3).unwrap();
+        masks.indexed_iter_mut().for_each(|((_, i, j), mask)| *mask *= (-at(i, j).powi(2)).exp());
+        let light = masks.sum_axis(Axis(0));
+        let mut y = noisy(measure(masks.view(), scene(8).view()).unwrap(), 0.01, 1).unwrap();
+        assert_eq!(outliers(y.view(), light.view(), 1), []);
+        let places = [(5, 7), (88, 90)];
+        let hot = 1.2 * y.iter().copied().fold(0.0, f32::max);
+        places.iter().for_each(|place| y[*place] = hot);
+        assert_eq!(outliers(y.view(), light.view(), 1), places);
+    }
+
+    #[test]
     fn areas_without_an_open_mask_are_reported() {
         let mut largest = Array2::from_elem((96, 96), 0.5);
         largest[[2, 2]] = f32::NAN;

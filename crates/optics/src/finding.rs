@@ -92,8 +92,8 @@ findings! {
     OneDimensional: [Calibration], [Warning],
         "the masks vary along one axis only",
         "check that the file has the axes [frame, row, column], and that the lithography mask is in place";
-    MissingPattern: [Calibration, Measurement], [Error],
-        "a pattern was not shown",
+    MissingPattern: [Calibration, Measurement], [Warning, Error],
+        "a pattern was not shown, or too briefly",
         REPEAT_PATTERNS;
     UnevenPatterns: [Calibration], [Warning],
         "a pattern is more than 30 % brighter or darker than the median",

@@ -19,7 +19,7 @@ use super::measurement_fit::{
     BLOCK, Fit, LocalFit, MIN_STRIPS, Strip, brightness_errors, equal_weights, reweighted,
 };
 use super::modulation::{Run, Unmodulated, unmodulated};
-use super::{Finding, FindingCode, Severity};
+use super::{Finding, FindingCode};
 
 /// Largest shift between masks and measurement that is searched, in pixels along each axis.
 pub const REACH: usize = 4;
@@ -1001,19 +1001,20 @@ fn missing_patterns(figures: &MeasurementFigures, frames: Vec<usize>) -> Option<
     if light.is_nan() {
         return None;
     }
-    if light < NO_LIGHT * brightest {
-        let detail = format!(
+    let is_dark = light < NO_LIGHT * brightest;
+    let detail = if is_dark {
+        format!(
             "frames {frames:?} (counted from 0) have no light: the LCoS did not show their patterns, or the scene was dark"
-        );
-        return Some(Finding::new(FindingCode::MissingPattern, detail).with_frames(frames));
-    }
-    let detail = format!(
-        "frames {frames:?} (counted from 0) have {:.0} % of the light of the brightest frame or less: the LCoS showed their \
-         patterns too briefly, or the light flickers",
-        100.0 * light / brightest
-    );
+        )
+    } else {
+        format!(
+            "frames {frames:?} (counted from 0) have {:.0} % of the light of the brightest frame or less: the LCoS showed \
+             their patterns too briefly, or the light flickers",
+            100.0 * light / brightest
+        )
+    };
     let finding = Finding::new(FindingCode::MissingPattern, detail).with_frames(frames);
-    Some(Finding { severity: Severity::Warning, ..finding })
+    Some(finding.escalate_if(is_dark))
 }
 
 /// An offset that no mask explains, which indicates that the dark frames are missing or wrong.
@@ -1077,7 +1078,7 @@ mod tests {
 
     use super::{BitUsage, MeasurementStudy, judge_measurement};
     use crate::masks::turning_circle;
-    use crate::{iid_masks, measure, noisy, random_squares};
+    use crate::{FindingCode, Severity, iid_masks, measure, noisy, random_squares};
 
     /// A disc that moves over a textured background.
     fn scene(frames: usize, side: usize) -> Array3<f32> {
@@ -1511,6 +1512,37 @@ mod tests {
             assert_eq!(codes(&other, &y), [expected], "other masks, noise {noise}");
             let right = codes(&masks, &y);
             assert_eq!(right.contains(&"unverified_masks"), noise > 0.0, "{right:?}");
+        }
+    }
+
+    /// A lamp that flickers is no pattern that was not shown.
+    #[test]
+    fn dim_frames_are_no_error() {
+        let masks = fine_masks(4, 136);
+        for (light, severity) in [(0.02, Severity::Error), (0.2, Severity::Warning)] {
+            let mut scene = scene(4, 136);
+            scene.index_axis_mut(ndarray::Axis(0), 2).mapv_inplace(|x| x * light);
+            let y = noisy(measure(masks.view(), scene.view()).unwrap(), 0.01, 1).unwrap();
+            let mut study = MeasurementStudy::new(4);
+            study.add(masks.view(), y.view(), (0, 0));
+            let found = judge_measurement(&study.finish().unwrap(), true);
+            let missing = found.iter().find(|one| one.code == FindingCode::MissingPattern).unwrap();
+            assert_eq!((missing.severity, &*missing.frames), (severity, &[2][..]), "{light}");
+        }
+    }
+
+    /// A missing or wrong dark is noticed in pictures with one or two strips of blocks.
+    #[test]
+    fn the_dark_of_low_pictures_is_checked() {
+        for rows in [16, 24] {
+            let (masks, scene) = (fine_masks(8, 136), scene(8, 136));
+            let low = s![.., ..rows, ..];
+            let y = measure(masks.slice(low), scene.slice(low)).unwrap();
+            let y = noisy(y, 0.02, 1).unwrap();
+            let masks = masks.slice(low).to_owned();
+            assert!(codes_without_dark(&masks, &y).is_empty(), "{rows}");
+            let lifted = codes_without_dark(&masks, &(&y + 0.4 * y.mean().unwrap()));
+            assert_eq!(lifted, ["no_dark"], "{rows}");
         }
     }
 
