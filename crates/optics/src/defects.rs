@@ -66,8 +66,8 @@ const TOO_DARK: f32 = 0.05;
 /// Smallest deviations of outliers, as shares of the 99th percentile of the snapshot.
 const MIN_EXCESS: f32 = 0.1;
 const MIN_DEFICIT: f32 = 0.25;
-/// Masks must pass this share of the mean light, or of that of a dim pixel, to compare the brightness of neighbours, and to
-/// call a pixel dark.
+/// Masks must pass this share of the mean light to compare the brightness of neighbours, or of that of the pixel in a dim area,
+/// and this share to call a pixel dark.
 const ENOUGH_LIGHT: f32 = 0.25;
 const MUCH_LIGHT: f32 = 0.75;
 
@@ -109,25 +109,33 @@ pub fn outliers(
         if !value.is_finite() || !(value > excess || may_be_dark) {
             return false;
         }
-        let is_dim = own < ENOUGH_LIGHT * mean_light;
-        let enough = ENOUGH_LIGHT * if is_dim { own } else { mean_light };
-        let (mut values, mut ratios) = ([f32::NEG_INFINITY; FEW + 1], [f32::NEG_INFINITY; FEW + 1]);
-        let mut darkest = [f32::INFINITY; FEW];
-        for row_near in neighbours(row, height) {
-            for column_near in neighbours(column, width) {
-                let (near, light) = (y[[row_near, column_near]], light[[row_near, column_near]]);
-                if (row_near, column_near) == (row, column) || !near.is_finite() {
-                    continue;
-                }
-                insert(&mut values, near, |new, old| new > old);
-                if light > enough {
-                    insert(&mut ratios, near / light, |new, old| new > old);
-                    insert(&mut darkest, near / light, |new, old| new < old);
+        let compare = |enough: f32| {
+            let mut values = [f32::NEG_INFINITY; FEW + 1];
+            let mut ratios = [f32::NEG_INFINITY; FEW + 1];
+            let mut darkest = [f32::INFINITY; FEW];
+            for row_near in neighbours(row, height) {
+                for column_near in neighbours(column, width) {
+                    let near = y[[row_near, column_near]];
+                    if (row_near, column_near) == (row, column) || !near.is_finite() {
+                        continue;
+                    }
+                    insert(&mut values, near, |new, old| new > old);
+                    let light = light[[row_near, column_near]];
+                    if light > enough {
+                        insert(&mut ratios, near / light, |new, old| new > old);
+                        insert(&mut darkest, near / light, |new, old| new < old);
+                    }
                 }
             }
+            [values[FEW], ratios[FEW], darkest[FEW - 1]]
+        };
+        let mut compared = compare(ENOUGH_LIGHT * mean_light);
+        if !compared[1].is_finite() {
+            // The area is dim.
+            compared = compare(ENOUGH_LIGHT * own);
         }
-        let (brightest, ratio, darkest) = (values[FEW], ratios[FEW], darkest[FEW - 1]);
-        if !(brightest.is_finite() && ratio.is_finite() && darkest.is_finite()) {
+        let [brightest, ratio, darkest] = compared;
+        if !compared.iter().all(|value| value.is_finite()) {
             return false;
         }
         let is_hot = value > TOO_BRIGHT * brightest.max(0.0) + excess
