@@ -4,14 +4,16 @@
     python calibrated.py --masks scene.mat --scene scene.mat --data DATA --out run/scene --minutes 480
 
 The folder --out gets `network.onnx` with its model card `README.md`, the validation curve `curve.csv`, and
-`checkpoint.pt`, from which the same command continues. --minutes counts the training time of all runs. --masks is npy
-[frame, row, column] on [0,1], or a .mat scene with `mask` [row, column, frame]. --scene is a .mat scene behind these masks
-that is evaluated too.
+`checkpoint.pt`, from which the same command continues. It is written every minute, and when the command is interrupted.
+--minutes counts the training time of all runs. --masks is npy [frame, row, column] on [0,1], or a .mat scene with `mask`
+[row, column, frame]. --scene is a .mat scene behind these masks that is evaluated too.
 """
 import argparse
 import csv
 import math
 import os
+import signal
+import sys
 import time
 
 import numpy as np
@@ -26,6 +28,7 @@ from evaluate import psnr
 from model import conv
 
 NOISE = .4, 10 / 255   # share of noisy measurements, and their largest sigma
+PAUSE = 60             # seconds between two checkpoints, and between two lines of progress
 
 
 class Residual(nn.Module):
@@ -95,6 +98,8 @@ def read_masks(path):
         masks = scipy.io.loadmat(path)['mask'].transpose(2, 0, 1)
     else:
         masks = np.load(path)
+        if not isinstance(masks, np.ndarray):
+            raise SystemExit(f'{path} has several arrays: save the masks alone with numpy.save')
     masks = masks.astype(np.float32)
     if masks.ndim != 3 or masks.min() < 0 or masks.max() > 1:
         raise SystemExit(f'{path}: the masks must be [frame, row, column] on [0,1], not {masks.shape} '
@@ -165,6 +170,7 @@ class Training:
             for optimizer, saved in zip(self.optimizers, state['optimizers']):
                 optimizer.load_state_dict(saved)
             self.step, self.seconds, self.curve = state['step'], state['seconds'], state['curve']
+            print(f'continues from step {self.step}, after {self.seconds / 60:.1f} minutes', flush=True)
 
     def save(self):
         state = {'shape': self.shape, 'net': self.net.state_dict(), 'average': self.average, 'step': self.step,
@@ -200,6 +206,9 @@ class Training:
         return net.to(self.device).eval()
 
     def evaluate(self, validation):
+        self.save()
+        if self.curve and self.curve[-1]['step'] == self.step:
+            return
         row = {'minutes': round(self.seconds / 60, 1), 'step': self.step, **validation.row(self.averaged(), self.device)}
         self.curve.append(row)
         print(' '.join(f'{name} {value}' for name, value in row.items()), flush=True)
@@ -287,18 +296,30 @@ def main():
     if a.crop % 4 or a.crop > min(masks.shape[1:]):
         p.error(f'--crop {a.crop}: give a multiple of 4 up to the sides of the masks, {masks.shape[1]}x{masks.shape[2]}')
 
+    if not os.path.exists(os.path.join(a.data, 'INDEX.tsv')):
+        p.error(f'--data {a.data}: the folder has no INDEX.tsv; make it with pack.py')
+    # Producers end with this process. An interruption is for this one alone.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Start producers before the GPU's context exists, because a process with a context must not fork.
     batches = train.start_producers(produce, a.workers, a.data, masks, a.clips, a.crop)
+    stopped = []
+    for name in signal.SIGINT, signal.SIGTERM:
+        signal.signal(name, lambda number, frame: stopped.append(number))
     validation = Validation(a.data, masks, a.scene)
     t = Training(a, masks, device)
     end, last = min(60 * a.minutes, t.seconds + 60 * a.run_minutes), t.step + a.steps if a.steps else math.inf
-    evaluated, loss = t.seconds, 0.
+    evaluated, saved, loss = t.seconds, -math.inf, 0.
     while t.seconds < end and t.step < last:
+        if stopped:
+            t.save()
+            sys.exit(f'interrupted at step {t.step}, after {t.seconds / 60:.1f} minutes; the same command continues')
         began = time.monotonic()
         error = t.learn(*batches.get())
         loss = error if not loss else .98 * loss + .02 * error
         t.seconds += time.monotonic() - began
-        if t.step % 100 == 0:
+        if t.seconds - saved > PAUSE:
+            saved = t.seconds
+            t.save()
             print(f'{t.seconds / 60:.1f} min, step {t.step}, rms error {loss:.4f}', flush=True)
         if t.seconds - evaluated > 60 * a.every:
             evaluated = t.seconds

@@ -5,6 +5,7 @@ evaluate.
 """
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -133,6 +134,14 @@ def test_network_for_one_calibration():
         train()   # continues; the exported network is compared with PyTorch
         with open(os.path.join(out, 'curve.csv'), encoding='utf8') as f:
             assert [line.split(',')[1] for line in f][1:] == ['3', '6']
+        line = [sys.executable, os.path.join(HERE, 'calibrated.py'), '--masks', masks, '--data', data, '--out', out,
+                '--crop', '32', '--clips', '2', '--width', '16', '--stages', '2', '--threads', '1']
+        with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert 'continues from step 6' in process.stdout.readline()
+            assert 'step 7' in process.stdout.readline()
+            process.send_signal(signal.SIGINT)
+            assert 'interrupted at step' in process.communicate(timeout=120)[1] and process.returncode == 1
+        assert torch.load(os.path.join(out, 'checkpoint.pt'), weights_only=True)['step'] > 6
         with open(os.path.join(out, 'README.md'), encoding='utf8') as f:
             assert '6 frames of 50x50 pixels' in f.read()
         frames, = export.session(os.path.join(out, 'network.onnx')).run(None, {
