@@ -99,10 +99,10 @@ impl Lab {
 }
 
 #[tokio::test]
-async fn a_calibration_precedes_every_job_and_is_visible() {
+async fn a_calibration_precedes_the_jobs_of_its_lab_and_is_visible() {
     let lab = Lab::new().await;
     let local = engine::job::Lab::local();
-    let job = lab.submit(100).await;
+    let job = lab.submit(0).await;
     let (first, second) = (lab.calibrate().await, lab.calibrate().await);
     let counts = lab.store.task_counts().await.unwrap();
     assert_eq!(counts[&("calibration".into(), TaskState::Ready)], 2);
