@@ -63,7 +63,7 @@ pub struct BlockFit {
     /// Mean share of the energy that the masks explain beyond those of other blocks, relative to the rest of these: the
     /// largest after a displacement along the dispersion.
     pub gain: f64,
-    /// Standard error of `gain`, as if masks of the measurement had none: a cautious one.
+    /// Standard error of `gain` if its true value is 0. It is larger than `scatter` where the masks gain.
     pub error: f64,
     /// Standard error of `gain` from its scatter between the blocks; infinite for up to three blocks.
     pub scatter: f64,

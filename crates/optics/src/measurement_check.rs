@@ -66,8 +66,9 @@ const MIN_INVERTED: f64 = 0.05;
 /// Smallest negative brightness of all frames together, relative to the mean of the measurement. Behind inverted masks it
 /// exceeds that mean. The sum is certain even where similar masks leave single frames uncertain.
 const MIN_NEGATIVE: f64 = 0.5;
-/// A shift that explains more than all of the fine structure has masks of more energy than the fit. Masks that explain this
-/// share without it are not shifted.
+/// A shift may seem to explain more than all of the fine structure, if the shifted masks have more energy than those of the fit.
+/// From this share on it says nothing about masks that explain [`UNSHIFTED`] without it.
+const TOO_MUCH: f64 = 1.1;
 const UNSHIFTED: f64 = 0.6;
 /// Masks that explain less than this share of the fine structure show no displacement.
 const MIN_EXPLAINED: f64 = 0.02;
@@ -823,7 +824,7 @@ fn shifted_masks(figures: &MeasurementFigures) -> Option<Finding> {
     let significant = figures.shift != (0, 0)
         // Masks that are shifted copies of each other also explain much of a shifted measurement.
         && figures.explained > 1.03 * figures.explained_unshifted
-        && (figures.explained < 1.1 || figures.explained_unshifted < UNSHIFTED)
+        && (figures.explained < TOO_MUCH || figures.explained_unshifted < UNSHIFTED)
         && figures.shift_significance > SHIFT_SIGNIFICANCE
         && figures.explained > MIN_EXPLAINED;
     significant.then(|| {
@@ -996,11 +997,11 @@ fn uneven_brightness(figures: &MeasurementFigures, not_shown: &[usize]) -> Optio
 
 /// Frames without light, which indicate that their patterns were not shown. A lamp that flickers dims frames, too.
 fn missing_patterns(figures: &MeasurementFigures, frames: Vec<usize>) -> Option<Finding> {
-    let brightest = figures.brightness.iter().copied().fold(0.0, f64::max);
-    let light = frames.iter().map(|k| figures.brightness[*k]).fold(f64::NAN, f64::max);
-    if light.is_nan() {
+    if frames.is_empty() {
         return None;
     }
+    let brightest = figures.brightness.iter().copied().fold(0.0, f64::max);
+    let light = frames.iter().map(|k| figures.brightness[*k]).fold(0.0, f64::max);
     let is_dark = light < NO_LIGHT * brightest;
     let detail = if is_dark {
         format!(
@@ -1484,7 +1485,7 @@ mod tests {
         }
     }
 
-    /// A strip of 8 rows has no scatter.
+    /// The strips are cut into pieces, whose scatter gives a standard error.
     #[test]
     fn low_pictures_are_no_mosaic() {
         for (seed, rows) in (0..40).zip([16, 20, 23, 24, 31].into_iter().cycle()) {

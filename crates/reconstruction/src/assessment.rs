@@ -183,7 +183,7 @@ pub enum Coverage {
 /// Smallest share of the pixels of a block that must be measured.
 const MIN_MEASURED: f32 = 1.0 / 16.0;
 
-/// Masks with smaller values only are closed, even if they leak.
+/// Pixels that were not measured are closed if all their masks are below this value. The intake leaves such pixels out.
 const OPEN: f32 = 0.05;
 
 /// The coverage of each block \[S, rows, columns\] by the snapshots `y` \[S,H,W\] behind masks whose largest value at each

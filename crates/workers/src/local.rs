@@ -118,7 +118,7 @@ impl Local {
                 TaskInput::Tile(Box::new(tile_task(task, snapshot, tile)?))
             }
             TaskKind::White => TaskInput::White {
-                // The command without a service has these masks alone when it looks for dim pixels.
+                // As `reconstruct` does, which looks for dim pixels before it moves the masks.
                 arrays: Arrays { correction: None, ..arrays },
                 recipe: Box::new(recipe(task)?),
                 snapshots: spec.snapshots,

@@ -134,8 +134,8 @@ fn check_count(opened: &Opened) -> Result<()> {
 }
 
 /// Reads a measurement, subtracts the dark frames, divides by the full scale, and passes each snapshot \[H,W\] to
-/// `sink`. Pixels that are saturated, bad, not measured, or hardly lit by any mask become NaN. Returns findings on the bit depth, and on snapshots
-/// with pixels that carry no information.
+/// `sink`. Pixels that are saturated, bad, not measured, or hardly lit by any mask become NaN. Returns findings on the bit
+/// depth, and on snapshots with pixels that carry no information.
 ///
 /// Errors: [`IntakeError::Size`] for dark frames of another size; [`IntakeError::Format`] for unreadable files and
 /// measurements without light, and for errors of `sink`. After an error the output of `sink` is invalid.
